@@ -1,0 +1,150 @@
+"""What no single file of a cell can tell alone: do cell, profile, URDF and tool fit together?"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from asc_rt import topics
+from asc_rt.cell_files import CellFile, ProfileFile, ToolFile
+from asc_rt.explain import suggestion
+from drivers import registry
+
+GROUND_TRUTH = "ground-truth"
+LEAST_RANGE_DEG = 20  # of a joint; 2 pi and less look like radians
+URDF_TOLERANCE_DEG = 0.1
+
+
+class Faults(list[str]):
+    def note(self, path: Path, key: str, text: str) -> None:
+        """One line: file, key, what is wrong; what would be right."""
+        self.append(f"{path}: {key}: {text}")
+
+
+def check_urdf(path: Path, profile: ProfileFile, urdf: Path, text: str, faults: Faults) -> None:
+    """The profile (at `path`) against its URDF: links, joints, limits."""
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        faults.append(f"{urdf}:{error.position[0]}: malformed URDF: {error}")
+        return
+    links = [link.get("name", "") for link in root.iter("link")]
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    named = [("flange", profile.flange), *((f"capsules[{i}].link", c.link) for i, c in enumerate(profile.capsules))]
+    for key, link in named:
+        if link not in links:
+            near = suggestion(link, links)
+            faults.note(path, key, f"link {link!r} is not in {urdf.name};{near} links: {', '.join(links)}")
+    for i, name in enumerate(profile.joints.names):
+        if name not in joints:
+            known = ", ".join(joints)
+            faults.note(path, f"joints.names[{i}]", f"joint {name!r} is not in {urdf.name}; joints: {known}")
+        elif i < len(profile.joints.position_deg):
+            _check_joint(path, i, profile.joints.position_deg[i], joints[name], faults)
+
+
+def _check_joint(path: Path, i: int, limits: tuple[float, float], joint: ET.Element, faults: Faults) -> None:
+    limit = joint.find("limit")
+    if joint.get("type") != "revolute" or limit is None:
+        faults.note(path, f"joints.names[{i}]", f"{joint.get('name')} is not a revolute joint with limits in the URDF")
+        return
+    low, high = (math.degrees(float(limit.get(side, "nan"))) for side in ("lower", "upper"))
+    if not (low - URDF_TOLERANCE_DEG <= limits[0] and limits[1] <= high + URDF_TOLERANCE_DEG):
+        wide = f"{limits[0]:g} to {limits[1]:g} deg"
+        faults.note(path, f"joints.position_deg[{i}]", f"{wide} is wider than the URDF's {low:g} to {high:g} deg")
+
+
+def check_profile(path: Path, profile: ProfileFile, faults: Faults) -> None:
+    joints, n = profile.joints, len(profile.joints.names)
+    for key in ("position_deg", "velocity_deg_s", "acceleration_deg_s2", "jerk_deg_s3"):
+        if (count := len(getattr(joints, key))) != n:
+            faults.note(path, f"joints.{key}", f"{count} values for {n} joints; one each for {', '.join(joints.names)}")
+    for i, (low, high) in enumerate(joints.position_deg):
+        key = f"joints.position_deg[{i}]"
+        if low >= high:
+            faults.note(path, key, f"{low:g} to {high:g} deg is no range; the lower limit first")
+        elif high - low < LEAST_RANGE_DEG:
+            faults.note(path, key, f"a range of {high - low:g} deg is implausible; degrees, not radians")
+
+
+def check_tool(path: Path, tool: ToolFile, profile: ProfileFile, faults: Faults) -> None:
+    if tool.mass_kg > profile.payload_kg:
+        more = f"{tool.mass_kg:g} kg is more than the payload of {profile.name}, {profile.payload_kg:g} kg"
+        faults.note(path, "mass_kg", f"{more}; a lighter tool or a stronger robot")
+    if tool.mass_kg > 0 and not _is_solid(tool.inertia):
+        faults.note(
+            path,
+            "inertia",
+            f"no solid body has {list(tool.inertia)} kg m2; xx xy xz yy yz zz about the centre of mass, "
+            "positive definite, each diagonal element at most the sum of the other two",
+        )
+
+
+def _is_solid(inertia: tuple[float, float, float, float, float, float]) -> bool:
+    """Positive definite by its leading minors, and the triangle inequality of the diagonal."""
+    xx, xy, xz, yy, yz, zz = inertia
+    minor = xx * yy - xy * xy
+    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    return xx > 0 and minor > 0 and determinant > 0 and 2 * max(xx, yy, zz) <= (xx + yy + zz) * (1 + 1e-9)
+
+
+def check_cell(path: Path, cell: CellFile, profile: ProfileFile, faults: Faults) -> None:
+    joints, safety = profile.joints, cell.safety
+    for i, goal in enumerate(cell.task.goals_deg):
+        if len(goal) != len(joints.names):
+            faults.note(
+                path, f"task.goals_deg[{i}]", f"{len(goal)} angles; {profile.name} has {len(joints.names)} joints"
+            )
+            continue
+        for j, (angle, (low, high)) in enumerate(zip(goal, joints.position_deg, strict=False)):
+            if not low <= angle <= high:
+                limits = f"the limits of {joints.names[j]}, {low:g} to {high:g} deg"
+                faults.note(path, f"task.goals_deg[{i}][{j}]", f"{angle:g} deg is outside {limits}")
+    least = f"safety.d_min_m = {safety.d_min_m:g} m"
+    if safety.activation_m <= safety.d_min_m:
+        faults.note(path, "safety.activation_m", f"{safety.activation_m:g} m is too small; above {least}")
+    if safety.rearm_distance_m < safety.d_min_m:
+        faults.note(path, "safety.rearm_distance_m", f"{safety.rearm_distance_m:g} m is too small; at least {least}")
+    if cell.sim and not cell.simulated:
+        faults.note(path, "sim", "this cell is real; [sim.*] tables belong to a cell with simulated = true")
+    for device in cell.sim.keys() - topics.SIM_DEVICES.keys():
+        known = list(topics.SIM_DEVICES)
+        near = suggestion(device, known)
+        faults.note(path, f"sim.{device}", f"unknown device;{near} known: {', '.join(known)}")
+    _check_driver(path, cell, faults)
+
+
+def _check_driver(path: Path, cell: CellFile, faults: Faults) -> None:
+    """The driver knows its own options; making one opens nothing."""
+    known = sorted(registry.known())
+    if cell.driver.name not in known:
+        near = suggestion(cell.driver.name, known)
+        faults.note(path, "driver.name", f"{cell.driver.name!r} is unknown;{near} known: {', '.join(known)}")
+        return
+    try:
+        registry.driver_class(cell.driver.name)(cell.driver.model_extra or {})
+    except ValueError as error:
+        faults.note(path, "driver", str(error))
+
+
+def calibration_hash(path: Path, cell: CellFile, faults: Faults) -> int:
+    """The number that human messages must carry; 0: ground truth, which exists in simulation only."""
+    if cell.human.calibration == GROUND_TRUTH:
+        if not cell.simulated:
+            wrong = f"{GROUND_TRUTH!r} exists in simulation only"
+            faults.note(path, "human.calibration", f"{wrong}; the sensor's calibration file")
+        return 0
+    file = path.parent / cell.human.calibration
+    try:
+        return hash_number(hashlib.sha256(file.read_bytes()).digest())
+    except OSError as error:
+        wrong = f"{file}: {error.strerror}"
+        faults.note(path, "human.calibration", f"{wrong}; the sensor's calibration file, or {GROUND_TRUTH!r}")
+        return 0
+
+
+def hash_number(digest: bytes) -> int:
+    """The number that stands for a SHA-256 digest in states and records: its first 8 bytes; 0 for none."""
+    return int.from_bytes(digest[:8], "big")

@@ -1,0 +1,261 @@
+"""`asc`: the command line. Exit codes: 0 as it should be, 1 what was checked does not hold, 2 bad usage or bad input.
+
+Results go to stdout, with --json as one object on the last line; everything else goes to stderr. Libraries are imported
+by the command that needs them: `asc --help` must not wait for them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+from contextlib import suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+DEFAULT_CELL = "fanuc-sim"
+BAD_INPUT = 2
+
+app = typer.Typer(
+    help="Safe robot cell: control, record, replay, view. Not a safety-rated function.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+CellName = Annotated[str, typer.Argument(metavar="[CELL]", help="name under asc_rt/cells, or path to a cell file")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="put over the cell file; may be repeated")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="one JSON object as the last line of stdout")]
+
+
+class Device(StrEnum):
+    FANUC = "fanuc"
+    HUMAN = "human"
+
+
+class Benchmark(StrEnum):
+    STEP = "step"
+    CYCLE = "cycle"
+    ALL = "all"
+
+
+@app.command()
+def run(
+    cell: CellName = DEFAULT_CELL,
+    duration: Annotated[float | None, typer.Option(help="seconds; without it until Ctrl-C", metavar="S")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="recording to write; default: a new file in the cell's log.dir")
+    ] = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a cell: controller, logger and, in a simulated cell, robot and person. Example: asc run --duration 20"""
+    from asc_rt.config import load_cell
+    from asc_rt.supervisor import run_cell
+
+    if duration is not None and not (math.isfinite(duration) and duration > 0):
+        _refuse(f"--duration: {duration:g} s is not possible; more than 0")
+    config = load_cell(cell, overrides or [])
+    path = log or config.log_dir / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+    if path.exists():
+        _refuse(f"--log: {path} exists; recordings are never overwritten")
+    session = run_cell(config, path, duration)
+    from logs.summary import summarise
+
+    if log is None:
+        _point_latest(path)
+    result = summarise(path)
+    result["exit_reason"] = session.exit_reason(result["exit_reason"])
+    result["processes_lost"] = session.deaths
+    _show(result, as_json)
+    raise typer.Exit(0 if session.completed and not result["robot_caused_violations"] else 1)
+
+
+@app.command()
+def sim(
+    device: Device,
+    cell: CellName = DEFAULT_CELL,
+    port: Annotated[int | None, typer.Option(help="UDP port of the robot; default: the cell's driver.port")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="fanuc: exit 1 if the client broke the protocol")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """One simulated device alone, for a controller elsewhere. Example: asc sim fanuc --port 60015"""
+    from asc_rt.config import load_cell
+    from asc_rt.processes import run_device
+
+    changes = [*(overrides or []), *([f"driver.port={port}"] if port is not None else [])]
+    config = load_cell(cell, changes)
+    raise typer.Exit(run_device(config, device.value, ["--strict"] if strict else []))
+
+
+@app.command()
+def replay(
+    log: Path,
+    start: Annotated[int, typer.Option("--from", help="number of the first cycle to run again", metavar="N")] = 0,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="what if: another value of [safety]")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run every recorded decision again and compare the bytes. Example: asc replay runs/LOG.mcap"""
+    _limit_blas()
+    from functools import partial
+
+    from tqdm import tqdm
+
+    from asc_rt.config import what_if
+    from logs.reader import open_log
+    from logs.replay import replay as replay_log
+
+    params = what_if(open_log(log).params, overrides) if overrides else None
+    try:
+        report = replay_log(log, start, params=params, progress=partial(tqdm, unit=" cycles", disable=None))
+    except IndexError as error:
+        _refuse(f"--from: {error}")
+    _show(report.as_dict(), as_json)
+    holds = report.mismatches == 0 and report.wire_mismatches == 0
+    raise typer.Exit(0 if holds or overrides else 1)
+
+
+@app.command()
+def view(
+    log: Path,
+    save: Annotated[Path | None, typer.Option(help="write a .rrd file instead of opening the viewer")] = None,
+    shot: Annotated[Path | None, typer.Option(help="write a picture, .png")] = None,
+    at: Annotated[float | None, typer.Option(help="moment of the picture, seconds", metavar="S")] = None,
+    web: Annotated[bool, typer.Option("--web", help="serve the viewer to a browser")] = False,
+) -> None:
+    """Open a recording in Rerun. Example: asc view runs/LOG.mcap"""
+    from logs.view import view as view_log
+
+    view_log(log, save=save, shot=shot, at=at, web=web)
+
+
+@app.command()
+def bench(
+    what: Annotated[
+        Benchmark, typer.Argument(help="step: the decision alone; cycle: in a loop at the cell's period")
+    ] = Benchmark.ALL,
+    cell: Annotated[str, typer.Option(help="cell whose robot and period are used")] = DEFAULT_CELL,
+    as_json: AsJson = False,
+) -> None:
+    """Measure one decision and the punctuality of the loop, beside the cell's period. Example: asc bench cycle"""
+    _limit_blas()
+    from asc_rt.bench import run as run_bench
+
+    result = run_bench(what.value, cell)
+    if as_json:
+        _show(result, as_json)
+        return
+    print(result["machine"])
+    for line in result["missing"]:
+        print(f"real-time set-up lacks {line}", file=sys.stderr)
+    for row in result["rows"]:
+        print(f"{row['name']:24} {row['value']:10.1f} {row['unit']} {row['ratio']:8.2%} of the period")
+
+
+@app.command()
+def doctor(cell: CellName = DEFAULT_CELL, as_json: AsJson = False) -> None:
+    """Is this PC, and this cell, fit to run? Example: asc doctor fanuc-sim"""
+    from asc_rt.doctor import examine
+
+    result = examine(cell)
+    if as_json:
+        _show(result, as_json)
+    else:
+        for check in result["checks"]:
+            fix = "" if check["ok"] else f" | do: {check['fix']}"
+            print(f"{'ok  ' if check['ok'] else 'FAIL'} {check['name']}: {check['detail']}{fix}")
+    raise typer.Exit(0 if result["ok"] else 1)
+
+
+def main() -> NoReturn:
+    """Entry point of `asc`."""
+    code = _run()
+    with suppress(BrokenPipeError):
+        sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # some libraries print about themselves when the interpreter is torn down
+
+
+def _run() -> int:
+    try:
+        app()
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else BAD_INPUT
+    except Exception as error:
+        lines = _lines(error)
+        if lines is None:
+            raise
+        for line in lines:
+            print(f"error: {line}", file=sys.stderr)
+        return BAD_INPUT
+    return 0
+
+
+def _lines(error: Exception) -> list[str] | None:
+    """What to tell of an error that is the input's fault; None: it is ours."""
+    from asc_rt.bus import BusError
+    from asc_rt.config import ConfigError
+    from asc_rt.ring import RingError
+    from asc_rt.supervisor import StartError
+    from logs.mcap_scan import LogError
+
+    if isinstance(error, ConfigError):
+        return list(error.lines)
+    if isinstance(error, BusError | RingError):
+        return [f"{error}; {error.hint}" if error.hint else str(error)]
+    if isinstance(error, StartError | LogError):
+        return [str(error)]
+    if isinstance(error, OSError) and error.filename:
+        return [f"{error.filename}: {error.strerror}"]
+    return None
+
+
+def _point_latest(log: Path) -> None:
+    """`latest.mcap` beside the recordings is the newest one."""
+    link = log.with_name("latest.mcap")
+    link.unlink(missing_ok=True)
+    link.symlink_to(log.name)
+
+
+def _refuse(line: str) -> NoReturn:
+    print(f"error: {line}", file=sys.stderr)
+    raise typer.Exit(BAD_INPUT)
+
+
+def _show(result: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(result, allow_nan=False))
+        return
+    for key, value in result.items():
+        print(f"{key:24} {_text(value)}")
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return "; ".join(_text(item) for item in value) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _limit_blas() -> None:
+    """Replay and benchmarks must run as the control process does."""
+    from asc_rt import realtime
+
+    realtime.one_blas_thread()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""The control process: `python -m asc_rt.control CELL --ring PATH [--set key=value]`.
+
+Exit code 0: the session ended as asked; 1: it ended for a fault; 2: it did not begin. Errors: one line each on stderr.
+"""
+
+from __future__ import annotations
+
+from asc_rt import realtime
+
+if __name__ == "__main__":
+    realtime.one_blas_thread()  # before anything below imports numpy
+
+import argparse
+import os
+import signal
+import sys
+import time
+import traceback
+from typing import Any
+
+from asc_rt import pacing, topics
+from asc_rt.bus import Bus, BusError, open_client
+from asc_rt.config import Cell, ConfigError, load_cell
+from asc_rt.core.system import System
+from asc_rt.core.types import CommandKind, CoreState, CycleInputs, CycleOutputs, Mode, StopReason
+from asc_rt.core.warm import warm_up
+from asc_rt.cycle import run
+from asc_rt.inputs import Mail
+from asc_rt.record import RecordError, RecordLayout, Timings
+from asc_rt.ring import RingError, RingWriter, wire_path, wire_tap
+from drivers import registry
+from drivers.base import DriverCaps, DriverError, HandshakeError, RobotDriver, RobotFaulted, WriteReceipt
+
+COMPLETED, FAILED, NOT_BEGUN = 0, 1, 2
+
+
+class RingRecorder:
+    """Packs each cycle into the ring. `unrecorded` counts the cycles that did not fit the record."""
+
+    def __init__(self, ring: RingWriter, layout: RecordLayout) -> None:
+        self.unrecorded = 0
+        self._ring, self._layout, self._buffer = ring, layout, layout.buffer()
+
+    def put(
+        self, before: CoreState, x: CycleInputs, out: CycleOutputs, sent: WriteReceipt | None, timings: Timings
+    ) -> None:
+        try:
+            self._layout.pack(self._buffer, before, x, out, sent, timings)
+        except RecordError:
+            self.unrecorded += 1
+            return
+        self._ring.put(self._buffer)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m asc_rt.control", description="The control process of a cell.")
+    parser.add_argument("cell", help="cell file or name of a cell")
+    parser.add_argument("--ring", required=True, help="ring of the session in shared memory, made by the supervisor")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="put over the cell file")
+    args = parser.parse_args(argv)
+    try:
+        cell = load_cell(args.cell, args.set)
+    except ConfigError as error:
+        for line in error.lines:
+            print(f"error: {line}", file=sys.stderr)
+        return NOT_BEGUN
+    try:
+        system = System(cell.params)
+        warm_up(system)
+        with (
+            open_client(cell.bus_endpoint) as bus,
+            RingWriter(args.ring) as ring,
+            RingWriter(wire_path(args.ring)) as wire,
+        ):
+            recorder = RingRecorder(ring, RecordLayout(system.n))
+            driver = registry.driver_class(cell.driver["name"])(cell.driver_options, wire_tap(wire))
+            return _session(cell, system, driver, bus, recorder)
+    except (BusError, RingError) as error:
+        _complain(error)
+        return NOT_BEGUN
+    except KeyboardInterrupt:
+        return FAILED
+
+
+def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder: RingRecorder) -> int:
+    """From opening the robot's link to releasing it; start, end and errors are told on the bus."""
+    tell = bus.event_publisher(topics.CONTROL.key).put_json
+    mail = Mail(
+        bus.latest(topics.HUMAN.key), bus.queue(topics.OPERATOR.key), bus.latest(topics.GOAL.key), joints=system.n
+    )
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: setattr(mail, "end_requested", True))
+    code, end = NOT_BEGUN, {"mode": Mode.IDLE.name, "reason": StopReason.EXCEPTION.name}
+    try:
+        caps = driver.configure()
+        _check(caps, system)
+        report = realtime.set_up(cell.realtime.priority, cell.realtime.cpu)
+        driver.activate(cell.params.period_ns)
+        tell({"event": "start", "pid": os.getpid(), "robot": caps.identity, "realtime": report})
+        code = FAILED
+        pacer = pacing.make(caps.pacing, cell.params.period_ns)
+        state = run(system, driver, mail, recorder, pacer, time.monotonic_ns)
+        end = {"mode": state.mode.name, "reason": state.reason.name}
+        code = COMPLETED if state.mode is Mode.ENDED else FAILED
+    except DriverError as error:
+        _complain(error)
+        faulted = isinstance(error, RobotFaulted)
+        end["reason"] = StopReason.ROBOT_FAULTED.name if faulted else StopReason.EXCEPTION.name
+        end |= {"error": str(error), "hint": error.hint}
+    except Exception as error:  # the robot is stopped (cycle.run); what is left is to tell
+        _complain(error)
+        end |= {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
+    finally:
+        driver.close()
+    tell({"event": "end", "code": code, "unrecorded": recorder.unrecorded, "refused": list(mail.faults), **end})
+    return code
+
+
+def _check(caps: DriverCaps, system: System) -> None:
+    if caps.dof != system.n:
+        raise HandshakeError(
+            f"the robot ({caps.identity}) has {caps.dof} joints, the cell's robot {system.n}",
+            hint="let the cell's `robot` be the one that is connected",
+        )
+    if CommandKind.POSITION not in caps.kinds:
+        raise HandshakeError(f"the robot ({caps.identity}) takes no joint positions", hint="use another driver")
+
+
+def _complain(error: Exception) -> None:
+    hint: Any = getattr(error, "hint", "")
+    text = str(error) if hint else f"{type(error).__name__}: {error}"
+    print(f"error: {text}" + (f" | do: {hint}" if hint else ""), file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    exit_code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(exit_code)  # some libraries print about themselves when the interpreter is torn down

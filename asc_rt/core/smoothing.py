@@ -1,0 +1,68 @@
+"""Jerk-limited set-points that reproduce the filtered acceleration to the bit of the limits.
+
+Ruckig, velocity interface, from the commanded state: after one period the acceleration is u and the speed is the
+trapezoid dq + T (ddq + u) / 2. The jerk bound |u - ddq| <= J T is inside the QP, so there is always such a profile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import ruckig
+
+from asc_rt.core.system import System
+from asc_rt.core.types import CoreState, Vector, vector
+
+# Rounding of (u - ddq) / T must not make the exact profile look too fast.
+ROUNDING = 1.0 + 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class SetPoint:
+    q: Vector  # rad
+    dq: Vector
+    ddq: Vector
+
+
+class SmoothingError(Exception):
+    """Ruckig has no profile for this acceleration; a limit did not hold where it should have."""
+
+
+def smooth(system: System, state: CoreState, u: Vector) -> SetPoint:
+    """The set-point one period on. Raises SmoothingError."""
+    T = system.params.period
+    target = [v + T * (a + b) / 2.0 for v, a, b in zip(state.dq_cmd, state.ddq_cmd, u, strict=True)]
+    return profile(system, state, target, u.tolist(), minimum_duration=T)
+
+
+def profile(
+    system: System,
+    state: CoreState,
+    dq: list[float],
+    ddq: list[float],
+    minimum_duration: float | None = None,
+) -> SetPoint:
+    """One period along Ruckig's profile from the commanded state to the speed dq and the acceleration ddq."""
+    r = system.params.robot
+    request = ruckig.InputParameter(system.n)
+    request.control_interface = ruckig.ControlInterface.Velocity
+    request.synchronization = ruckig.Synchronization.No
+    request.current_position = state.q_cmd.tolist()
+    request.current_velocity = state.dq_cmd.tolist()
+    request.current_acceleration = state.ddq_cmd.tolist()
+    request.target_velocity = dq
+    request.target_acceleration = ddq
+    request.max_acceleration = [ROUNDING * a for a in r.ddq_max]
+    request.max_jerk = [ROUNDING * j for j in r.dddq_max]
+    if minimum_duration is not None:
+        request.minimum_duration = minimum_duration
+        request.synchronization = ruckig.Synchronization.Time
+    plan = ruckig.Trajectory(system.n)
+    try:
+        result = system.planner.calculate(request, plan)
+    except ruckig.RuckigError as error:
+        raise SmoothingError(str(error)) from error
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise SmoothingError(str(result))
+    q, v, a = plan.at_time(system.params.period)
+    return SetPoint(vector(q), vector(v), vector(a))

@@ -1,0 +1,300 @@
+"""Dataclasses as protobuf messages of a fixed size.
+
+Where every field has a fixed size, protobuf tags and lengths stand at fixed places: one `struct` writes the message, a
+numpy dtype reads it, and any protobuf reader understands it. A `Message` says which fields a dataclass has; a `Part` is
+such a message ready to pack.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import operator
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from google.protobuf import descriptor_pb2
+
+PACKAGE = "asc.v1"
+
+Buffer = bytes | bytearray | memoryview
+
+
+class RecordError(ValueError):
+    """A value that does not fit into the record, or bytes that are not a record."""
+
+
+class Unsigned(int):
+    """Marks an integer that uses all 64 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Array:
+    """A column of numbers: as long as the message's count, else one row per joint; `width` numbers in each row."""
+
+    dtype: str = "<f8"
+    width: int = 1
+
+
+JOINTS = COLUMN = Array()
+POINTS = Array(width=3)
+INDICES = Array("<i8")
+
+
+class Message:
+    """One dataclass as a protobuf message. Fields: name -> Python type, Array or Message; the order numbers them.
+
+    `optional`: None is a value of its own (a flag `present`). `capacity`: the arrays hold 0..capacity rows (a field
+    `count`), else n. Scalars stand before arrays, arrays before messages, whatever order the table has.
+    """
+
+    def __init__(
+        self,
+        cls: type,
+        fields: dict[str, Any],
+        *,
+        optional: bool = False,
+        capacity: int = 0,
+        encode: Callable[[Any], Any] | None = None,
+        decode: Callable[[Any], Any] | None = None,
+    ) -> None:
+        self.cls, self.optional, self.capacity, self.encode, self.decode = cls, optional, capacity, encode, decode
+        self.messages = {k: v for k, v in fields.items() if isinstance(v, Message)}
+        self.arrays = {k: v for k, v in fields.items() if isinstance(v, Array)}
+        self.scalars = {k: v for k, v in fields.items() if k not in self.messages and k not in self.arrays}
+        self.head: dict[str, type] = ({"present": bool} if optional else {}) | ({"count": int} if capacity else {})
+
+
+# --- from the table to bytes -----------------------------------------------------------------------------------------
+
+VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5  # protobuf wire types
+FieldProto = descriptor_pb2.FieldDescriptorProto
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """One number or array of the record."""
+
+    path: str  # "inputs.joint.q"
+    tag: bytes  # the constant bytes before it: protobuf tags and lengths, also of the messages that begin here
+    code: str  # of `struct`
+    format: str  # of numpy, one element
+    shape: tuple[int, ...]
+    kind: type  # Python type of a scalar; float or int for arrays
+    offset: int = 0  # of the value, from the start of the record
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize("<" + self.code)
+
+
+def _wire(kind: type) -> tuple[str, str, int, int]:
+    """struct code, numpy format, protobuf type, wire type of a scalar. Enums and bools: varints of one byte (< 128)."""
+    if issubclass(kind, float):
+        return "d", "<f8", FieldProto.TYPE_DOUBLE, FIXED64
+    if issubclass(kind, bool):
+        return "B", "u1", FieldProto.TYPE_BOOL, VARINT
+    if issubclass(kind, IntEnum):
+        return "B", "u1", FieldProto.TYPE_ENUM, VARINT
+    if issubclass(kind, Unsigned):
+        return "Q", "<u8", FieldProto.TYPE_FIXED64, FIXED64
+    return "q", "<i8", FieldProto.TYPE_SFIXED64, FIXED64
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def tag(number: int, wire_type: int) -> bytes:
+    return _varint(number << 3 | wire_type)
+
+
+def _leaves(message: Message, n: int, path: str) -> list[Leaf]:
+    """Every leaf of a message in its order of bytes, without the header of the message itself."""
+    found: list[Leaf] = []
+    numbers = itertools.count(1)
+    for name, kind in (message.head | message.scalars).items():
+        code, fmt, _, wire_type = _wire(kind)
+        found.append(Leaf(f"{path}.{name}", tag(next(numbers), wire_type), code, fmt, (), kind))
+    for name, array in message.arrays.items():
+        rows = message.capacity or n
+        size = 8 * rows * array.width
+        shape = (rows,) if array.width == 1 else (rows, array.width)
+        kind = float if array.dtype == "<f8" else int
+        head = tag(next(numbers), LENGTH) + _varint(size)
+        found.append(Leaf(f"{path}.{name}", head, f"{size}s", array.dtype, shape, kind))
+    for name, inner in message.messages.items():
+        found += _headed(next(numbers), _leaves(inner, n, f"{path}.{name}"))
+    return found
+
+
+def _headed(number: int, leaves: list[Leaf]) -> list[Leaf]:
+    """The leaves of a message with its tag and length put before the first."""
+    size = sum(len(leaf.tag) + leaf.size for leaf in leaves)
+    first = leaves[0]
+    head = tag(number, LENGTH) + _varint(size) + first.tag
+    return [dataclasses.replace(first, tag=head), *leaves[1:]]
+
+
+def _gather(message: Message, path: str, it: str, names: dict[str, Any]) -> str:
+    """Source of the values of `message`, found in the expression `it`, in the order of the leaves.
+
+    The record is written in every cycle, and a tuple display is three times as fast as a walk over the table
+    (MEASURED: 6 us against 19 us). `names` receives the objects that the source speaks of.
+    """
+    items = ["1"] if message.optional else []
+    if message.capacity:
+        arrays = ", ".join(f"{it}.{name}" for name in message.arrays)
+        items.append(f"_count({message.capacity}, {path!r}, {arrays})")
+    items += [f"{it}.{name}" for name in message.scalars]
+    items += [f"{it}.{name}.tobytes()" for name in message.arrays]
+    for name, inner in message.messages.items():
+        inner_path, inner_it = f"{path}.{name}", f"{it}.{name}"
+        if inner.encode is not None:
+            names[f"encode_{name}"] = inner.encode
+            names[f"gather_{name}"] = _compile(inner, inner_path)
+            items.append(f"*gather_{name}(encode_{name}({inner_it}))")
+        elif inner.optional:
+            absent = f"absent_{inner_path.replace('.', '_')}"
+            names[absent] = _absent(inner)
+            items.append(f"*({absent} if {inner_it} is None else ({_gather(inner, inner_path, inner_it, names)}))")
+        else:
+            items.append(_gather(inner, inner_path, inner_it, names).rstrip(","))
+    return ", ".join(items) + ","
+
+
+def _compile(message: Message, path: str) -> Callable[[Any], tuple[Any, ...]]:
+    names: dict[str, Any] = {"_count": _count}
+    made: Callable[[Any], tuple[Any, ...]] = eval(f"lambda it: ({_gather(message, path, 'it', names)})", names)
+    return made
+
+
+def _count(capacity: int, path: str, *arrays: np.ndarray[Any, Any]) -> int:
+    count, *others = set(map(len, arrays))
+    if others or count > capacity:
+        raise RecordError(f"{path}: arrays of {sorted({count, *others})} rows; one length up to {capacity} fits")
+    return count
+
+
+def _absent(message: Message) -> tuple[Any, ...]:
+    """The values of None: the flag and all else zero."""
+    inner = itertools.chain.from_iterable(map(_absent, message.messages.values()))
+    return (*[0] * (len(message.head) + len(message.scalars)), *[b""] * len(message.arrays), *inner)
+
+
+def _build(message: Message, path: str, n: int, row: Iterator[Any]) -> Any:
+    """The object that the values of a row stand for: inverse of `_gather`."""
+    if message.optional and not next(row):
+        for _ in _absent(message)[1:]:
+            next(row)
+        return None
+    rows = message.capacity or n
+    count = next(row) if message.capacity else n
+    if count > rows:
+        raise RecordError(f"{path}.count: {count} is more than {rows}")
+    made = {name: _scalar(f"{path}.{name}", kind, next(row)) for name, kind in message.scalars.items()}
+    for name, array in message.arrays.items():
+        flat = np.frombuffer(next(row), dtype=array.dtype, count=count * array.width)
+        made[name] = flat if array.width == 1 else flat.reshape(count, array.width)
+    for name, inner in message.messages.items():
+        made[name] = _build(inner, f"{path}.{name}", n, row)
+    obj = message.cls(**made)
+    return obj if message.decode is None else message.decode(obj)
+
+
+def _scalar(path: str, kind: type, value: Any) -> Any:
+    try:
+        return value if kind is Unsigned else kind(value)
+    except ValueError as error:
+        raise RecordError(f"{path}: {value} is no {kind.__name__}") from error
+
+
+class Part:
+    """One top-level message of the record (`state`, `inputs`, ...): packs and unpacks on its own."""
+
+    def __init__(self, name: str, number: int, message: Message, n: int, offset: int) -> None:
+        self.name, self.offset, self._message, self._n = name, offset, message, n
+        self._gather, self._absent = _compile(message, name), _absent(message)
+        leaves = _headed(number, _leaves(message, n, name))
+        self._struct = struct.Struct("<" + "".join(f"{len(leaf.tag)}s{leaf.code}" for leaf in leaves))
+        self.size = self._struct.size
+        self.leaves: list[Leaf] = []
+        for leaf in leaves:
+            offset += len(leaf.tag)
+            self.leaves.append(dataclasses.replace(leaf, offset=offset))
+            offset += leaf.size
+        self._template: list[Any] = [x for leaf in leaves for x in (leaf.tag, None)]
+        fixed = [2 * i + 1 for i, leaf in enumerate(leaves) if leaf.shape == (n,)]
+        self._joint_arrays = operator.itemgetter(*fixed) if len(fixed) > 1 else lambda row: [row[i] for i in fixed]
+        self._joint_sizes = {0, 8 * n}  # 0: the message is absent
+
+    def pack_into(self, record: bytearray | memoryview, obj: Any) -> None:
+        try:
+            self._struct.pack_into(record, self.offset, *self._row(obj))
+        except struct.error as error:
+            raise RecordError(f"{self.name}: a number does not fit into the record: {error}") from error
+
+    def pack(self, obj: Any) -> bytes:
+        """The bytes of this part alone."""
+        record = bytearray(self.offset + self.size)
+        self.pack_into(record, obj)
+        return self.bytes_of(record)
+
+    def unpack(self, record: Buffer) -> Any:
+        return _build(self._message, self.name, self._n, iter(self._struct.unpack_from(record, self.offset)[1::2]))
+
+    def bytes_of(self, record: Buffer) -> bytes:
+        return bytes(record[self.offset : self.offset + self.size])
+
+    def _row(self, obj: Any) -> list[Any]:
+        """Tags and values by turns, as the struct takes them."""
+        row = [*self._template]
+        row[1::2] = self._absent if obj is None else self._gather(obj)
+        if not self._joint_sizes.issuperset(map(len, self._joint_arrays(row))):
+            raise RecordError(f"{self.name}: an array of joints is not {self._n} float64")  # struct would pad or cut it
+        return row
+
+
+# --- from the table to protobuf --------------------------------------------------------------------------------------
+
+
+def add_field(into: descriptor_pb2.DescriptorProto, name: str, number: int, kind: int, type_name: str = "") -> None:
+    field = into.field.add(name=name, number=number, label=FieldProto.LABEL_OPTIONAL)
+    field.type = kind
+    if type_name:
+        field.type_name = f".{PACKAGE}.{type_name}"
+
+
+def describe(file: descriptor_pb2.FileDescriptorProto, message: Message) -> str:
+    """Add the message type and all that it uses to `file`; its name."""
+    name = f"{'Optional' if message.optional else ''}{message.cls.__name__}"
+    if any(known.name == name for known in file.message_type):
+        return name
+    made = file.message_type.add(name=name)
+    numbers = itertools.count(1)
+    for field, kind in (message.head | message.scalars).items():
+        enum = _describe_enum(file, kind) if issubclass(kind, IntEnum) else ""
+        add_field(made, field, next(numbers), _wire(kind)[2], enum)
+    for field, array in message.arrays.items():
+        column = made.field.add(name=field, number=next(numbers), label=FieldProto.LABEL_REPEATED)
+        column.type = FieldProto.TYPE_DOUBLE if array.dtype == "<f8" else FieldProto.TYPE_SFIXED64
+        column.options.packed = True
+    for field, inner in message.messages.items():
+        add_field(made, field, next(numbers), FieldProto.TYPE_MESSAGE, describe(file, inner))
+    return name
+
+
+def _describe_enum(file: descriptor_pb2.FileDescriptorProto, kind: type[IntEnum]) -> str:
+    if not any(known.name == kind.__name__ for known in file.enum_type):
+        made = file.enum_type.add(name=kind.__name__)
+        for value in kind:  # protobuf enum values share one namespace: prefix them
+            made.value.add(name=f"{kind.__name__}_{value.name}", number=value.value)
+    return kind.__name__

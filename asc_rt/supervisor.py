@@ -1,0 +1,204 @@
+"""`asc run`: start a cell's processes, operate it, watch it, end it, and tell what happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from asc_rt import ring, topics
+from asc_rt.bus import Bus, open_router
+from asc_rt.config import Cell
+from asc_rt.console import Keyboard, Operator
+from asc_rt.core.types import EventKind
+from asc_rt.processes import Death, Process, Processes, describe, table
+from asc_rt.record import RecordLayout
+
+READY_TIMEOUT_S = 60.0  # of one process, compiling included
+CONTROL_END_TIMEOUT_S = 15.0
+LAST_WORDS_S = 1.0  # for what the control process said last to arrive
+POLL_S = 0.02
+BAR = "{l_bar}{bar}| {n:.0f}/{total:.0f} s"
+
+
+class StartError(Exception):
+    """The session did not begin. The process at fault has said why on stderr."""
+
+
+@dataclass(slots=True)
+class Session:
+    """What the supervisor found out; the rest is in the log."""
+
+    log: Path
+    started: bool = False
+    control_code: int | None = None
+    end: dict[str, Any] = field(default_factory=dict)  # what the control process said last
+    deaths: list[str] = field(default_factory=list)  # processes that ended before they were asked to
+    recorded: bool = True  # the logger lived to the end
+
+    @property
+    def completed(self) -> bool:
+        """It ended as asked, and all of it is in the log."""
+        return self.control_code == 0 and self.recorded
+
+    def exit_reason(self, logged: str) -> str:
+        """Why it ended; `logged`: what the log says."""
+        if self.completed:
+            return "completed"
+        if self.control_code == 0:
+            return "LOGGER_DIED"
+        return str(self.end.get("reason", "CONTROL_DIED")) if logged in ("UNFINISHED", "SESSION_END") else logged
+
+
+def run_cell(cell: Cell, log: Path, duration_s: float | None) -> Session:
+    """Run `cell` for `duration_s`, or until Ctrl-C, and record it to `log`.
+
+    BusError, RingError: nothing was started. StartError: a process did not become ready; all are ended.
+    """
+    ring_path = Path(f"/dev/shm/asc-{cell.name}-{os.getpid()}")
+    session = Session(log)
+    with open_router(cell.bus_endpoint) as bus:
+        ring.create_session(ring_path, RecordLayout(cell.params.n).size, cell.params.period_ns)
+        processes = Processes()
+        interrupts: list[int] = []
+        old = {s: signal.signal(s, lambda n, _: interrupts.append(n)) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            _Supervisor(cell, bus, processes, session, interrupts).run(ring_path, duration_s)
+        finally:
+            processes.end_all()
+            session.control_code = processes.code("control")
+            for number, handler in old.items():
+                signal.signal(number, handler)
+            session.recorded = processes.code("logger") == 0
+            if session.recorded or not session.started:
+                ring.remove_session(ring_path)
+            else:
+                print(f"the logger failed: cycles that are not in the log are in {ring_path}", file=sys.stderr)
+    return session
+
+
+class _Supervisor:
+    def __init__(self, cell: Cell, bus: Bus, processes: Processes, session: Session, interrupts: list[int]) -> None:
+        self._cell, self._processes, self._session, self._interrupts = cell, processes, session, interrupts
+        self._state_box = bus.latest(topics.STATE.key)
+        self._control_box = bus.queue(topics.CONTROL.key)
+        self._device_boxes = {name: bus.latest(topic.key) for name, topic in topics.SIM_DEVICES.items()}
+        events, goals = bus.event_publisher(topics.OPERATOR.key), bus.event_publisher(topics.GOAL.key)
+        self._operator = Operator(events, goals, cell.goals, arms_itself=cell.simulated)
+        self._keyboard = None if cell.simulated else Keyboard()
+        self._said: tuple[Any, ...] = ()
+
+    def run(self, ring_path: Path, duration_s: float | None) -> None:
+        self._start(ring_path)
+        self._operate(duration_s)
+        self._finish()
+
+    # --- start -------------------------------------------------------------------------------------------------------
+
+    def _start(self, ring_path: Path) -> None:
+        """One process after the other, each when the one before can be used; the control process last."""
+        for spec in table(self._cell, ring_path, self._session.log).values():
+            print(f"start {spec.name}", file=sys.stderr)
+            self._processes.start(spec)
+            deadline = time.monotonic() + READY_TIMEOUT_S
+            while not self._is_ready(spec.name):
+                if (code := self._processes.code(spec.name)) is not None:
+                    raise StartError(f"{spec.name} did not start: {describe(code)}")
+                if self._interrupts:
+                    raise StartError(f"interrupted while {spec.name} was starting")
+                if time.monotonic() > deadline:
+                    raise StartError(f"{spec.name} is not ready after {READY_TIMEOUT_S:g} s")
+                time.sleep(POLL_S)
+        self._session.started = True
+
+    def _is_ready(self, name: str) -> bool:
+        if name == "logger":
+            return self._session.log.exists()
+        if name == "control":
+            return self._heard("start") is not None
+        return self._device_boxes[name].take() is not None
+
+    def _heard(self, event: str) -> dict[str, Any] | None:
+        """What the control process said; the end of the session is remembered."""
+        while (data := self._control_box.take()) is not None:
+            message: dict[str, Any] = json.loads(data)
+            if message["event"] == "end":
+                self._session.end = message
+            if message["event"] == event:
+                _tell_missing(message.get("realtime", {}))
+                return message
+        return None
+
+    # --- operate -----------------------------------------------------------------------------------------------------
+
+    def _operate(self, duration_s: float | None) -> None:
+        """Until the duration is over, somebody interrupts, or a process ends that the session needs."""
+        started = time.monotonic()
+        if self._keyboard:
+            print("type arm, stop or end", file=sys.stderr)
+        with tqdm(total=duration_s, unit="s", disable=None, bar_format=None if duration_s is None else BAR) as bar:
+            while not self._interrupts and not self._must_end():
+                elapsed = time.monotonic() - started
+                if duration_s is not None and elapsed >= duration_s:
+                    return
+                bar.update(elapsed - bar.n)
+                self._hear_state()
+                if self._keyboard and self._type(self._keyboard):
+                    return
+                time.sleep(POLL_S)
+
+    def _hear_state(self) -> None:
+        if (data := self._state_box.take()) is None:
+            return
+        state = json.loads(data)
+        self._operator.hear(state, time.monotonic())
+        said = (state["mode"], state["reason"], state["reached_id"])
+        if said != self._said:
+            self._said = said
+            reason = "" if state["reason"] == "NONE" else f" ({state['reason']})"
+            tqdm.write(f"{state['mode']}{reason}, goals reached: {state['reached_id']}", file=sys.stderr)
+
+    def _type(self, keyboard: Keyboard) -> bool:
+        """Act on what a person typed; True: end the session."""
+        typed = keyboard.read()
+        if isinstance(typed, EventKind) and typed is not EventKind.END:
+            self._operator.say(typed)
+        elif isinstance(typed, str) and typed:
+            print(f"{typed!r}? type arm, stop or end", file=sys.stderr)
+        return typed is EventKind.END
+
+    def _must_end(self) -> bool:
+        """Tell of every process that ended by itself; True: the session cannot go on."""
+        ended = list(self._processes.newly_ended())
+        for process in ended:
+            self._note_death(process)
+        return any(process.spec.death is not Death.ROBOT_STOPS for process in ended)
+
+    def _note_death(self, process: Process) -> None:
+        code = process.code if process.code is not None else 0
+        line = f"{process.name} ended ({describe(code)}): {process.spec.death}"
+        self._session.deaths.append(line)
+        tqdm.write(line, file=sys.stderr)
+
+    # --- end ---------------------------------------------------------------------------------------------------------
+
+    def _finish(self) -> None:
+        """Ask the control process to end, and hear why it did; the caller ends the rest."""
+        if self._processes.code("control") is None:
+            self._operator.say(EventKind.END)
+            self._processes.wait("control", CONTROL_END_TIMEOUT_S)
+        deadline = time.monotonic() + LAST_WORDS_S
+        while self._heard("end") is None and not self._session.end and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+
+
+def _tell_missing(realtime: dict[str, Any]) -> None:
+    for line in realtime.get("missing", []):
+        print(f"real-time set-up lacks {line}", file=sys.stderr)

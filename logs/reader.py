@@ -1,0 +1,204 @@
+"""Open a recording: every checksum checked, cycles by number, messages by topic.
+
+    log = open_log("runs/x.mcap")
+    log.params, log.session, log.attachments["cell.toml"]
+    for batch in log.batches(): batch["outputs.decision.d_measured"]     # structured arrays, in order
+    for topic, t_ns, data in log.messages("/sim/truth"): ...
+
+A session that crashed leaves a file that just stops: all complete records of it are read, and `log.truncated` says so.
+Damage is an error. The file is mapped, never loaded: memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import itertools
+import json
+import mmap
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.records import Attachment, Channel, Metadata, Schema
+
+from asc_rt.core.params import Params
+from asc_rt.record import RecordLayout
+from logs import mcap_scan, schema
+from logs.mcap_scan import CorruptLog, Extent, ForeignFile, LogError, Op, Raw
+
+__all__ = ["CorruptLog", "ForeignFile", "Log", "LogError", "LogMessage", "open_log", "records"]
+
+Records = np.ndarray[Any, np.dtype[np.void]]
+
+
+class LogMessage(NamedTuple):
+    topic: str
+    t_ns: int  # monotonic time of the recording machine
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _ChunkRef:
+    raw: Raw
+    first: int  # number of the first cycle in it
+    cycles: int
+
+
+class Log:
+    """A recording. Made by `open_log`."""
+
+    def __init__(self, path: Path, data: mmap.mmap) -> None:
+        self.path, self._data, self._name = path, data, str(path)
+        self.attachments: dict[str, bytes] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.extent = Extent()
+        self._topics: dict[int, str] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._cycle_channel = -1
+        self._chunks: list[_ChunkRef] = []
+        self.cycles = 0
+        self._content = functools.lru_cache(4)(self._uncached_content)
+        self._scan()
+        self.params = self._load_params()
+        self.layout = RecordLayout(self.params.n)
+        try:
+            self._wall_minus_monotonic_ns = int(self.session["wall_minus_monotonic_ns"])
+        except (KeyError, ValueError) as error:
+            raise CorruptLog(f"{self._name}: damaged: its session metadata tell no clock") from error
+
+    @property
+    def truncated(self) -> bool:
+        """The file was not closed: it holds all complete records up to `extent.complete_bytes`."""
+        return not self.extent.closed
+
+    @property
+    def session(self) -> dict[str, str]:
+        return self.metadata.get(schema.SESSION, {})
+
+    @property
+    def end(self) -> dict[str, str]:
+        """What the logger wrote when it closed the file; empty: it did not."""
+        return self.metadata.get(schema.END, {})
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.attachments.get(schema.FINGERPRINT, b"{}"))
+        return found
+
+    def record(self, index: int) -> bytes:
+        """The bytes of cycle record `index`, counted from 0 in the order of the file."""
+        if not 0 <= index < self.cycles:
+            raise IndexError(index)
+        chunk = self._chunks[bisect.bisect_right(self._chunks, index, key=lambda c: c.first) - 1]
+        return self._cycle_data(chunk)[index - chunk.first]
+
+    def batches(self) -> Iterator[Records]:
+        """All cycle records in order, as structured arrays of a chunk each."""
+        for chunk in self._chunks:
+            if chunk.cycles:
+                yield np.frombuffer(b"".join(self._cycle_data(chunk)), self.layout.dtype)
+
+    def columns(self, *paths: str) -> dict[str, np.ndarray[Any, Any]]:
+        """Some fields of all cycles: path -> one array. Their copy is all that stays in memory."""
+        parts = [{path: batch[path].copy() for path in paths} for batch in self.batches()]
+        if not parts:
+            return {path: np.zeros(0, self.layout.dtype[path]) for path in paths}
+        return {path: np.concatenate([part[path] for part in parts]) for path in paths}
+
+    def messages(self, *topics: str) -> Iterator[LogMessage]:
+        """The messages of some topics, in the order of the file."""
+        wanted = {channel: topic for channel, topic in self._topics.items() if topic in topics}
+        for chunk in self._chunks:
+            content = self._content(chunk.raw)
+            for raw in mcap_scan.chunk_records(content, self._name):
+                if raw.op == Op.MESSAGE and mcap_scan.message_channel(content, raw) in wanted:
+                    found = mcap_scan.message(content, raw)
+                    t_ns = found.log_time_ns - self._wall_minus_monotonic_ns
+                    yield LogMessage(wanted[found.channel], t_ns, found.data)
+
+    def _uncached_content(self, raw: Raw) -> bytes:
+        return mcap_scan.chunk_data(self._data, self._name, raw)
+
+    def _cycle_data(self, chunk: _ChunkRef) -> list[bytes]:
+        content, channel = self._content(chunk.raw), self._cycle_channel
+        found = [
+            mcap_scan.message(content, raw).data
+            for raw in mcap_scan.chunk_records(content, self._name)
+            if raw.op == Op.MESSAGE and mcap_scan.message_channel(content, raw) == channel
+        ]
+        if any(len(data) != self.layout.size for data in found):
+            raise CorruptLog(f"{self._name}: damaged at byte {chunk.raw.start}: a cycle record of the wrong size")
+        return found
+
+    # --- opening -----------------------------------------------------------------------------------------------------
+
+    def _scan(self) -> None:
+        data, name = self._data, self._name
+        for raw in mcap_scan.frames(data, name, self.extent):
+            if raw.op == Op.CHUNK:
+                self._scan_chunk(raw)
+            elif raw.op == Op.ATTACHMENT:
+                attachment = mcap_scan.parse(Attachment, data, name, raw)
+                self.attachments[attachment.name] = attachment.data
+            elif raw.op == Op.METADATA:
+                metadata = mcap_scan.parse(Metadata, data, name, raw)
+                self.metadata[metadata.name] = metadata.metadata
+        if self._cycle_channel < 0 and (self.extent.closed or self._chunks):
+            raise ForeignFile(f"{name}: an MCAP file, but no recording of a cell (no {schema.CYCLE.topic})")
+
+    def _scan_chunk(self, chunk: Raw) -> None:
+        content = self._content(chunk)
+        cycles = 0
+        for raw in mcap_scan.chunk_records(content, self._name):
+            if raw.op == Op.MESSAGE:
+                cycles += mcap_scan.message_channel(content, raw) == self._cycle_channel
+            elif raw.op == Op.SCHEMA:
+                found = mcap_scan.parse(Schema, content, self._name, raw)
+                self._schemas[found.id] = found
+            elif raw.op == Op.CHANNEL:
+                self._meet(mcap_scan.parse(Channel, content, self._name, raw))
+        self._chunks.append(_ChunkRef(chunk, self.cycles, cycles))
+        self.cycles += cycles
+
+    def _meet(self, channel: Channel) -> None:
+        self._topics[channel.id] = channel.topic
+        if channel.topic != schema.CYCLE.topic:
+            return
+        found = self._schemas.get(channel.schema_id)
+        if found is None or found.data != schema.CYCLE.schema_data:
+            raise ForeignFile(
+                f"{self._name}: its cycle records have another schema: read it with the code that wrote it"
+            )
+        self._cycle_channel = channel.id
+
+    def _load_params(self) -> Params:
+        if schema.PARAMS not in self.attachments:
+            raise ForeignFile(
+                f"{self._name}: no {schema.PARAMS} in it: not a recording, or cut off before its first cycle"
+            )
+        try:
+            return Params.from_canonical(self.attachments[schema.PARAMS])
+        except (ValueError, TypeError, KeyError) as error:
+            raise ForeignFile(f"{self._name}: {schema.PARAMS} is of another version: {error}") from error
+
+
+def open_log(path: str | Path) -> Log:
+    """Map and check the whole file. LogError: not readable, foreign, damaged."""
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            if file.seek(0, 2) == 0:
+                raise ForeignFile(f"{path}: empty")
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
+    return Log(path, data)
+
+
+def records(path: str | Path) -> Records:
+    """All cycle records of a short recording as one structured array."""
+    log = open_log(path)
+    return np.frombuffer(b"".join(itertools.chain.from_iterable(log.batches())), log.layout.dtype)

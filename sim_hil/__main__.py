@@ -1,0 +1,25 @@
+"""`python -m sim_hil DEVICE CELL ...`: one simulated device as a process of its own."""
+
+from __future__ import annotations
+
+import sys
+
+USAGE = "usage: python -m sim_hil {fanuc | human} CELL [options]"
+
+
+def main(argv: list[str]) -> int:
+    match argv:
+        case ["fanuc", *rest]:
+            from sim_hil.fanuc import server
+
+            return server.main(rest)
+        case ["human", cell, *rest]:
+            from sim_hil import human
+
+            return human.main(cell, rest)
+    print(USAGE, file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

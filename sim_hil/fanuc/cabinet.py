@@ -1,0 +1,141 @@
+"""What every simulated controller has, whichever wire it speaks: arm, servos, signals, alarms, pendant, E-stop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sim_hil.fanuc import alarms
+from sim_hil.fanuc.alarms import Alarm
+from sim_hil.fanuc.arm import ARMS, Array, Plant, Servo
+from sim_hil.fanuc.settings import Settings
+from sim_hil.fanuc.signals import Signals
+
+Peer = tuple[str, int]
+
+READY, COMMANDED, SERVO_ON, MOVING = 1, 2, 4, 8
+_AT_REST = 1e-3  # rad/s
+
+
+@dataclass(frozen=True, slots=True)
+class Offence:
+    rule: str
+    data: bytes
+
+
+class Device(Protocol):
+    """What lockstep and server drive: a controller, or one with faults."""
+
+    settings: Settings
+
+    def cycle(self, packets: Iterable[tuple[Peer, bytes]]) -> list[tuple[Peer, bytes]]: ...
+
+
+class Cabinet:
+    def __init__(self, plant: Plant, settings: Settings | None = None) -> None:
+        self.settings = s = settings or Settings()
+        self.arm = ARMS[s.arm]
+        self.signals = Signals(s.tool)
+        self.alarms: list[Alarm] = []
+        self.offences: list[Offence] = []
+        self.pendant_enabled = False
+        self._plant = plant
+        brake = np.full(len(plant.q), math.radians(s.brake_deg_s2))
+        self._servo = Servo(plant.q, s.period, s.filter_cycles, s.lag_ms * 1e-3, brake)
+        self._cycles = 0
+        self._sequence = 0
+        self._clock_jump_ms = 0
+        self._stop_pressed = False
+
+    def cycle(self, packets: Iterable[tuple[Peer, bytes]]) -> list[tuple[Peer, bytes]]:
+        """One period: what came in since the last -> what goes out."""
+        raise NotImplementedError
+
+    def greeting(self, name: str) -> bytes:
+        """A "start" or "stop" as a PC would send it."""
+        raise NotImplementedError
+
+    # --- pendant and machine -------------------------------------------------------------------------------------
+
+    def press_emergency_stop(self) -> None:
+        if not self._stop_pressed:
+            self._stop_pressed = True
+            self._alarm(alarms.EMERGENCY_STOP)
+
+    def run_program(self) -> None:
+        """START at the pendant."""
+        raise NotImplementedError
+
+    def release_emergency_stop(self) -> None:
+        self._stop_pressed = False
+
+    def enable_pendant(self, on: bool = True) -> None:
+        """The switch of the teach pendant: while it is on, no program of AUTO runs."""
+        self.pendant_enabled = on
+        if on:
+            self._alarm(alarms.PENDANT)
+
+    def reset(self) -> None:
+        """RESET: alarms off whose cause is gone; the program has to be started again."""
+        self.alarms = [
+            alarm
+            for alarm, lasts in ((alarms.EMERGENCY_STOP, self._stop_pressed), (alarms.PENDANT, self.pendant_enabled))
+            if lasts
+        ]
+
+    def jump_clock(self, milliseconds: int) -> None:
+        """Somebody set the controller's clock."""
+        self._clock_jump_ms += milliseconds
+
+    def jump_sequence(self, number: int) -> None:
+        """The next status carries `number`."""
+        self._sequence = (number - 1) % 2**32
+
+    # --- state ---------------------------------------------------------------------------------------------------
+
+    @property
+    def sequence(self) -> int:
+        """Number of the status sent last."""
+        return self._sequence
+
+    @property
+    def servo_on(self) -> bool:
+        return alarms.EMERGENCY_STOP not in self.alarms
+
+    @property
+    def moving(self) -> bool:
+        return bool(np.max(np.abs(self._plant.dq)) > _AT_REST)
+
+    @property
+    def time_stamp(self) -> int:
+        return (int(self._cycles * self.settings.period_ms) + self._clock_jump_ms) // 2 * 2 % 2**32
+
+    @property
+    def currents(self) -> Array:
+        """Nine motor currents [A], proportional to the joint torques; zero for a plant without mass."""
+        torque = getattr(self._plant, "torque", None)
+        amperes = np.zeros(9)
+        if torque is not None:
+            amperes[: len(torque)] = np.abs(torque) * self.arm.ampere_per_nm
+        return amperes
+
+    # --- for the controllers -------------------------------------------------------------------------------------
+
+    def _alarm(self, alarm: Alarm, data: bytes | None = None) -> None:
+        """Latch an alarm; with `data` (also b"": a silence) it is the PC that broke a rule."""
+        self.alarms.append(alarm)
+        if data is not None:
+            self._offend(str(alarm), data)
+
+    def _offend(self, rule: str, data: bytes) -> None:
+        self.offences.append(Offence(rule, data))
+
+    def _drive(self) -> None:
+        """The mechanics, one period after the servos were told."""
+        self._plant.set_target(self._servo.q)
+        self._plant.step()
+        self._cycles += 1

@@ -1,0 +1,138 @@
+"""The simulated controller as a process: UDP in and out, one cycle each period of the monotonic clock.
+
+Exit code 0 after SIGTERM or SIGINT, 1 in strict mode with offences or without a bus, 2 for bad input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+
+from asc_rt.bus import BusError
+from asc_rt.config import Cell, ConfigError, load_cell
+from sim_hil.fanuc.arm import KinematicPlant
+from sim_hil.fanuc.cabinet import Peer
+from sim_hil.fanuc.controller import Controller
+from sim_hil.fanuc.settings import Settings
+from sim_hil.world import World
+
+PRIORITY = 40  # SCHED_FIFO; below the control process, whose deadlines this one must not disturb
+MAX_DATAGRAM = 2048
+MAX_PACKETS = 64  # of one cycle: a flood must not stop the controller's time
+
+Publish = Callable[[int], None]
+
+
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m sim_hil fanuc", description=__doc__.splitlines()[0])
+    parser.add_argument("cell", help="cell file or name of a cell")
+    parser.add_argument("--strict", action="store_true", help="exit code 1 if the PC broke the protocol")
+    parser.add_argument("--plant", choices=("mujoco", "kinematic"), default="mujoco",
+                        help="kinematic: no dynamics, no person, no bus")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="put over the cell file")
+    args = parser.parse_args(argv)
+    stop: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda signum, _: stop.append(signum))
+    try:
+        cell = load_cell(args.cell, args.set)
+        settings = Settings.parse({"period_ms": cell.params.period_ns * 1e-6, **cell.sim.get("fanuc", {})})
+        link = _bind(cell)
+    except (ConfigError, ValueError) as error:
+        return _fail(error, 2)
+    with link:
+        q0 = np.radians(settings.start_deg)
+        if args.plant == "kinematic":
+            return _run(link, Controller(KinematicPlant(q0, settings.period), settings), None, stop, args.strict)
+        try:
+            world = World(cell, q0)
+        except BusError as error:
+            return _fail(f"{error}; {error.hint}", 1)
+        try:
+            return _run(link, Controller(world, settings), world.publish, stop, args.strict)
+        finally:
+            world.close()
+
+
+def _bind(cell: Cell) -> socket.socket:
+    """ValueError: this cell's robot is not ours to simulate here."""
+    if cell.driver.get("name") != "fanuc-j519":
+        raise ValueError(f"the cell's driver is {cell.driver.get('name')!r}, not 'fanuc-j519'")
+    host, port = cell.driver["host"], cell.driver.get("port", 60015)
+    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    link.setblocking(False)
+    try:
+        link.bind((host, port))
+    except OSError as error:
+        link.close()
+        raise ValueError(f"cannot listen on {host}:{port}: {error.strerror}; is it running already?") from None
+    return link
+
+
+def _run(link: socket.socket, controller: Controller, publish: Publish | None, stop: list[int], strict: bool) -> int:
+    _make_real_time()
+    print("ready fanuc {}:{}".format(*link.getsockname()), flush=True)
+    cycles, skipped = serve(link, controller, publish, stop)
+    alarms = ", ".join(f"{alarm.number} {alarm.text}" for alarm in controller.alarms) or "none"
+    offences = len(controller.offences)
+    print(f"fanuc: {cycles} cycles, {skipped} skipped, {offences} offences, alarms: {alarms}", flush=True)
+    return 1 if strict and controller.offences else 0
+
+
+def serve(link: socket.socket, controller: Controller, publish: Publish | None, stop: list[int]) -> tuple[int, int]:
+    """Run until `stop` is not empty; (cycles run, periods skipped). Missed periods are lost time, never a burst."""
+    period_ns = round(controller.settings.period_ms * 1e6)
+    cycles = skipped = told = 0
+    due_ns = time.monotonic_ns() + period_ns
+    while not stop:
+        time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+        missed = (time.monotonic_ns() - due_ns) // period_ns
+        if missed > 0:
+            skipped += missed
+            due_ns += missed * period_ns
+        for peer, data in controller.cycle(_drain(link)):
+            with suppress(OSError):  # to a PC that went away or does not read it is lost, as on a cable
+                link.sendto(data, peer)
+        if publish is not None:
+            publish(time.monotonic_ns())
+        for offence in controller.offences[told:]:
+            print(f"fanuc: offence: {offence.rule}: {offence.data.hex() or 'no bytes'}", file=sys.stderr, flush=True)
+        told = len(controller.offences)
+        cycles += 1
+        due_ns += period_ns
+    return cycles, skipped
+
+
+def _drain(link: socket.socket) -> list[tuple[Peer, bytes]]:
+    packets: list[tuple[Peer, bytes]] = []
+    while len(packets) < MAX_PACKETS:
+        try:
+            data, peer = link.recvfrom(MAX_DATAGRAM)
+        except BlockingIOError:
+            break
+        packets.append((peer, data))
+    return packets
+
+
+def _make_real_time() -> None:
+    """Best effort: without it the simulated robot is only less punctual."""
+    gc.collect()
+    gc.freeze()
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError as error:
+        print(f"fanuc: runs without real-time priority ({error.strerror})", file=sys.stderr)
+
+
+def _fail(error: object, code: int) -> int:
+    print(f"fanuc: {error}", file=sys.stderr)
+    return code

@@ -1,0 +1,236 @@
+"""The simulated arm and what it does to a person: MuJoCo, built from the arm's own data files.
+
+An oracle that shares no code with the controller: MuJoCo reads the URDF itself; dynamics, distances and contacts are
+MuJoCo's. The joints are torque motors at 1 kHz under a stiff servo, as on the real arm: inverse dynamics, a velocity
+loop, and a position loop that asks for no more than the data sheet's speed; torque is cut at the URDF's efforts.
+The arm meets the person only: not itself and not the floor. The person's capsules are moved by hand (mocap), so a
+contact pushes the arm, never them; it is as soft as MuJoCo's default (20 ms).
+Units: SI, radians; robot base frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from asc_rt.core.params import CapsuleSpec, Params, ToolParams
+from asc_rt.core.types import MAX_CAPSULES
+from sim_hil.person import FLOOR_Z, Capsules
+
+Array = npt.NDArray[np.float64]
+
+SUBSTEP = 0.001  # s
+SERVO_BANDWIDTH = 120.0  # rad/s, ASSUMED: far above what a robot controller's set-points contain
+ROTOR_INERTIA = 1e-3  # kg m2 at the joint per Nm of effort, ASSUMED: not published, the size of a geared servo motor's
+PARKED = np.array([0.0, 0.0, -1000.0])  # m, where unused capsules of the person wait
+FAR = 1e3  # m, beyond this MuJoCo need not look
+SHORTEST = 1e-4  # m, half length of a person's capsule that is a sphere
+
+
+@dataclass(frozen=True, slots=True)
+class Nearest:
+    """The nearest robot-person pair of capsules."""
+
+    distance: float  # m between the surfaces, below zero inside; inf: nobody is there
+    robot_part: str  # URDF link, or tool0, tool1...
+    person_part: str
+    approach: float  # m/s, of the robot's nearest point towards the person, by the robot's own motion
+
+
+NOBODY = Nearest(float("inf"), "", "", 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    robot_part: str
+    person_part: str
+    depth: float  # m, deepest within the last period
+
+
+class MujocoPlant:
+    """`set_target`, then `step` one control period. Starts at rest at `q0` (rad; default all zero).
+
+    ValueError: URDF and joint list disagree. FloatingPointError from `step`: the simulation has diverged.
+    """
+
+    def __init__(self, params: Params, q0: npt.ArrayLike | None = None) -> None:
+        self._model = _build(params)
+        names = [self._model.joint(i).name for i in range(self._model.njnt)]
+        if names != list(params.robot.joints) or self._model.nv != params.n:
+            raise ValueError(f"joints of the URDF are {names}, of the profile {list(params.robot.joints)}")
+        self._data = mujoco.MjData(self._model)
+        self._substeps = max(1, round(params.period / SUBSTEP))
+        self._model.opt.timestep = params.period / self._substeps
+        self._period = params.period
+        self._fastest = np.array(params.robot.dq_max)
+        self._robot_geoms = [g for g in range(self._model.ngeom) if self._model.geom(g).name.startswith("robot/")]
+        self._person_geoms = [self._model.geom(f"person/{i}").id for i in range(MAX_CAPSULES)]
+        self.reset(np.zeros(params.n) if q0 is None else q0)
+
+    @property
+    def q(self) -> Array:
+        return self._data.qpos.copy()
+
+    @property
+    def dq(self) -> Array:
+        return self._data.qvel.copy()
+
+    @property
+    def torque(self) -> Array:
+        """Nm, of the last substep, after the limit."""
+        return self._data.qfrc_actuator.copy()
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """All contacts of robot and person within the last period."""
+        return tuple(Contact(*parts, depth) for parts, depth in self._contacts.items())
+
+    def reset(self, q: npt.ArrayLike) -> None:
+        """At rest at q, nobody there."""
+        mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = q
+        self._reached = self._target = self.q  # where the servo was and will be, at the end of a period
+        self._data.mocap_pos[:] = PARKED
+        self._labels: tuple[str, ...] = ()
+        self._contacts: dict[tuple[str, str], float] = {}
+        mujoco.mj_step1(self._model, self._data)
+
+    def set_target(self, q: npt.ArrayLike) -> None:
+        """Where the servo shall be at the end of the next period. ValueError: not finite numbers, one per joint."""
+        target = np.array(q, dtype=np.float64)
+        if target.shape != self._target.shape or not np.isfinite(target).all():
+            raise ValueError(f"target {target.tolist()}: {len(self._target)} finite angles are needed")
+        self._target = target
+
+    def step(self) -> None:
+        """One control period: the servo follows a straight line from the last target to the new one."""
+        model, data = self._model, self._data
+        start, way = self._reached, self._target - self._reached
+        speed = way / self._period
+        torque = np.empty(model.nv)
+        self._contacts = {}
+        for i in range(self._substeps):
+            error = start + way * ((i + 1) / self._substeps) - data.qpos
+            catch_up = np.clip(SERVO_BANDWIDTH / 2 * error, -self._fastest, self._fastest)
+            wish = 2 * SERVO_BANDWIDTH * (speed + catch_up - data.qvel)
+            mujoco.mj_mulM(model, data, torque, wish)
+            data.ctrl[:] = torque + data.qfrc_bias
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)  # positions, velocities and contacts of the new state
+            if data.ncon:
+                self._note_contacts()
+        if not np.isfinite(data.qpos).all():
+            raise FloatingPointError("the simulated arm has diverged")
+        self._reached = self._target
+
+    def set_person(self, person: Capsules) -> None:
+        """Put the person there. ValueError: more capsules than the plant has."""
+        m = len(person.radius)
+        if m > MAX_CAPSULES:
+            raise ValueError(f"{m} capsules of people, at most {MAX_CAPSULES}")
+        axis = person.p1 - person.p0
+        half = np.maximum(np.linalg.norm(axis, axis=1) / 2, SHORTEST)
+        geoms = self._person_geoms[:m]
+        self._model.geom_size[geoms, 0] = person.radius
+        self._model.geom_size[geoms, 1] = half
+        self._model.geom_rbound[geoms] = person.radius + half
+        self._data.mocap_pos[:m] = (person.p0 + person.p1) / 2
+        self._data.mocap_quat[:m] = _turn_z_to(axis)
+        self._data.mocap_pos[m:] = PARKED
+        self._labels = tuple(person.labels)
+        mujoco.mj_step1(self._model, self._data)
+
+    def distance(self) -> Nearest:
+        """Smallest distance of all robot-person pairs, now."""
+        if not self._labels:
+            return NOBODY
+        model, data = self._model, self._data
+        robot, person = np.array(self._robot_geoms), np.array(self._person_geoms[: len(self._labels)])
+        centre, bound = data.geom_xpos, model.geom_rbound
+        apart = np.linalg.norm(centre[robot][:, None] - centre[person][None], axis=2)
+        at_least = (apart - bound[robot][:, None] - bound[person][None]).ravel()
+        best, pair, points = FAR, (0, 0), np.zeros((6, 1))
+        for index in np.argsort(at_least):  # spheres around the capsules: most pairs need no closer look
+            if at_least[index] >= best:
+                break
+            candidate, ends = divmod(int(index), len(person)), np.zeros((6, 1))
+            d = mujoco.mj_geomDistance(model, data, robot[candidate[0]], person[candidate[1]], FAR, ends)
+            if d < best:
+                best, pair, points = d, candidate, ends
+        approach = self._approach(int(robot[pair[0]]), points[:3, 0], points[3:, 0], best)
+        return Nearest(best, self._part(int(robot[pair[0]])), self._labels[pair[1]], approach)
+
+    def _approach(self, geom: int, at: Array, towards: Array, distance: float) -> float:
+        line = (towards - at) * np.sign(distance)  # inside each other, the points change sides
+        length = float(np.linalg.norm(line))
+        if length == 0.0:
+            return 0.0
+        jacobian = np.zeros((3, self._model.nv))
+        mujoco.mj_jac(self._model, self._data, jacobian, None, at[:, None], self._model.geom_bodyid[geom])
+        return float(line @ jacobian @ self._data.qvel) / length
+
+    def _note_contacts(self) -> None:
+        contact = self._data.contact
+        for (robot, person), depth in zip(contact.geom, -contact.dist, strict=True):
+            parts = (self._part(int(robot)), self._labels[self._person_geoms.index(int(person))])
+            self._contacts[parts] = max(float(depth), self._contacts.get(parts, 0.0))
+
+    def _part(self, geom: int) -> str:
+        return str(self._model.geom(geom).name).split("/")[1]
+
+
+def _build(params: Params) -> Any:
+    spec = mujoco.MjSpec.from_string(params.robot.urdf)
+    spec.compiler.fusestatic = False  # keeps base and flange as bodies
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a diverged run must not look like a fresh one
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    floor = spec.worldbody.add_geom(name="floor", pos=[0, 0, FLOOR_Z], size=[5, 5, 0.1], contype=0, conaffinity=0)
+    floor.type = mujoco.mjtGeom.mjGEOM_PLANE
+    counts: dict[str, int] = {}
+    for capsule in params.robot.capsules:
+        i = counts[capsule.link] = counts.get(capsule.link, -1) + 1
+        _add_capsule(spec.body(capsule.link), f"robot/{capsule.link}/{i}", capsule)
+    flange = spec.body(params.robot.flange)
+    _add_mass(flange, params.tool)
+    for i, capsule in enumerate(params.tool.capsules):
+        _add_capsule(flange, f"robot/tool{i}", capsule)
+    robot = [geom.name for geom in spec.geoms if geom.name.startswith("robot/")]
+    for i in range(MAX_CAPSULES):
+        body = spec.worldbody.add_body(name=f"person/{i}", mocap=True)
+        geom = body.add_geom(name=f"person/{i}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.05, SHORTEST, 0])
+        geom.contype = geom.conaffinity = 0
+        for name in robot:  # explicit pairs pass by the bounding tree, which would not know of changed capsule sizes
+            spec.add_pair(geomname1=name, geomname2=geom.name, condim=1)
+    for joint in spec.joints:
+        motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+        joint.armature = ROTOR_INERTIA * joint.actfrcrange[1]  # the URDF's effort
+    return spec.compile()
+
+
+def _add_capsule(body: Any, name: str, capsule: CapsuleSpec) -> None:
+    is_sphere = capsule.p0 == capsule.p1
+    geom = body.add_geom(name=name, contype=0, conaffinity=0, mass=0)
+    if is_sphere:
+        geom.type, geom.pos, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, capsule.p0, [capsule.radius, 0, 0]
+    else:
+        geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, [*capsule.p0, *capsule.p1]
+        geom.size = [capsule.radius, 0, 0]
+
+
+def _add_mass(flange: Any, tool: ToolParams) -> None:
+    if tool.mass > 0:
+        xx, xy, xz, yy, yz, zz = tool.inertia
+        flange.mass, flange.ipos, flange.fullinertia = tool.mass, tool.com, [xx, yy, zz, xy, xz, yz]
+
+
+def _turn_z_to(axis: Array) -> Array:
+    """Quaternions (w, x, y, z) that turn the z axis to these directions; any for a zero axis."""
+    u = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
+    quaternion = np.stack([1 + u[:, 2], -u[:, 1], u[:, 0], np.zeros(len(u))], axis=1)
+    quaternion[u[:, 2] < -1 + 1e-9] = [0.0, 1.0, 0.0, 0.0]
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)

@@ -1,0 +1,225 @@
+"""A cell is loaded whole or refused whole: every fault at once, one line each, and each line says where and what."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asc_rt import config
+from asc_rt.config import CELLS, ConfigError, load_cell, what_if
+from asc_rt.core.params import Params
+
+
+def faults(cell: str | Path = "fanuc-sim", *overrides: str) -> tuple[str, ...]:
+    with pytest.raises(ConfigError) as caught:
+        load_cell(cell, overrides)
+    assert all("\n" not in line for line in caught.value.lines)
+    return caught.value.lines
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the data files that a test may spoil; `fanuc-sim` means the copy."""
+    for name in ("cells", "robots"):
+        shutil.copytree(config.PACKAGE / name, tmp_path / name)
+    monkeypatch.setattr(config, "CELLS", tmp_path / "cells")
+    monkeypatch.setattr(config, "ROBOTS", tmp_path / "robots")
+    monkeypatch.setattr(config, "TOOLS", tmp_path / "robots" / "tools")
+    return tmp_path
+
+
+def spoil(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+# --- what is loaded --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in CELLS.glob("*.toml")))
+def test_every_cell_that_we_ship_is_in_order(name: str) -> None:
+    cell = load_cell(name)
+    assert cell.name == name
+    assert Params.from_canonical(cell.params.canonical()) == cell.params
+
+
+def test_files_speak_degrees_and_milliseconds_the_parameters_si() -> None:
+    cell = load_cell("fanuc-sim", ["control.tracking_tolerance_deg=9", "human.age_limit_ms=150", "period_ms=4"])
+    p = cell.params
+    assert (p.period_ns, p.human.age_limit_ns) == (4_000_000, 150_000_000)
+    assert p.tracking_tolerance == math.radians(9)
+    assert p.robot.q_max[0] == math.radians(170)
+    assert p.robot.dq_max[0] == math.radians(450)
+    assert p.robot.command_latency_ns == 60_000_000
+    assert cell.goals[0][0] == math.radians(-60)
+    assert {c.link for c in p.tool.capsules} == {p.robot.flange}
+    assert "fanuc" in cell.sim and cell.simulated
+    assert cell.driver["name"] == "fanuc-j519" and "name" not in cell.driver_options
+
+
+def test_overrides_go_over_the_file_and_are_remembered() -> None:
+    plain, changed = load_cell("fanuc-sim"), load_cell("fanuc-sim", ["safety.d_min_m = 0.12", "tool=bat"])
+    assert plain.params.safety.d_min == 0.1
+    assert changed.params.safety.d_min == 0.12
+    assert changed.params.tool.name == "bat"
+    assert changed.overrides == ("safety.d_min_m = 0.12", "tool=bat")
+    assert changed.text == plain.text
+
+
+def test_a_cell_may_be_given_as_a_path(tmp_path: Path) -> None:
+    copy = tmp_path / "mine.toml"
+    shutil.copy(CELLS / "fanuc-sim.toml", copy)
+    assert load_cell(copy).path == copy
+
+
+def test_the_goals_of_the_cell_are_clear_of_the_mounting_plane() -> None:
+    cell = load_cell("fanuc-sim")
+    robot = cell.params.robot
+    model = pin.buildModelFromXML(robot.urdf)
+    data = model.createData()
+    for goal in cell.goals:
+        pin.framesForwardKinematics(model, data, np.array(goal))
+        for c in (*robot.capsules, *cell.params.tool.capsules):
+            if c.link in ("base", "j1"):
+                continue
+            placement = data.oMf[model.getFrameId(c.link)]
+            lowest = min(placement.act(np.array(p))[2] for p in (c.p0, c.p1)) - c.radius
+            assert lowest > 0.05, (goal, c.link)
+
+
+# --- what is refused -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("safety.d_min_m=-0.1", ["safety.d_min_m", "-0.1 m", "0 to 2 m", "sign"]),
+        ("safety.d_min_m=100", ["safety.d_min_m", "100 m", "unit"]),
+        ("safety.k=nan", ["safety.k", "nan", "not a finite number"]),
+        ("safety.eta=inf", ["safety.eta", "inf", "not a finite number"]),
+        ("safety.k='3'", ["safety.k", "'3'", "a number"]),
+        ("human.age_limit_ms=true", ["human.age_limit_ms", "True", "ms"]),
+        ("human.age_limit_ms=0.2", ["human.age_limit_ms", "0.2 ms", "10 to 1000 ms"]),
+        ("safety.d_mim_m=0.1", ["safety.d_mim_m", "unknown key", "did you mean 'd_min_m'"]),
+        ("saftey.d_min_m=0.1", ["saftey", "unknown key", "did you mean 'safety'"]),
+        ("period_ms=5", ["period_ms", "5 ms", "2, 4 or 8 ms"]),
+        ("simulated=1", ["simulated", "true or false"]),
+        ("realtime.cpu=1.5", ["realtime.cpu", "whole number"]),
+        ("robot=lrmate_200", ["robot", "did you mean 'lrmate_200id'", "known"]),
+        ("tool=dril", ["tool", "did you mean 'drill'", "bare"]),
+        ("driver.name=fanuc-519", ["driver.name", "did you mean 'fanuc-j519'"]),
+        ("driver.prt=1", ["driver", "'prt'", "port"]),
+        ("driver.version=9", ["driver", "version", "9"]),
+        ("bus.endpoint=127.0.0.1", ["bus.endpoint", "tcp/127.0.0.1:17447"]),
+        ("task.goals_deg=[]", ["task.goals_deg", "0 values"]),
+        ("task.goals_deg=[[1, 2]]", ["task.goals_deg[0]", "2 angles", "6 joints"]),
+        ("task.goals_deg=[[171, 0, 0, 0, 0, 0]]", ["task.goals_deg[0][0]", "171 deg", "J1", "-170 to 170 deg"]),
+        ("safety.activation_m=0.1", ["safety.activation_m", "above safety.d_min_m"]),
+        ("safety.rearm_distance_m=0.05", ["safety.rearm_distance_m", "at least safety.d_min_m"]),
+        ("human.calibration=missing.toml", ["human.calibration", "missing.toml"]),
+        ("sim.fanuk.x=1", ["sim.fanuk", "did you mean 'fanuc'"]),
+        ("control=3", ["control", "a table with"]),
+        ("no-equals-sign", ["--set no-equals-sign", "key=value"]),
+        ("name.x.y=1", ["--set name.x.y=1", "not a table"]),
+    ],
+)
+def test_one_wrong_value_is_one_clear_line(override: str, words: list[str]) -> None:
+    lines = faults("fanuc-sim", override)
+    assert len(lines) == 1, lines
+    for word in words:
+        assert word in lines[0]
+
+
+def test_every_fault_is_told_at_once_and_with_the_file() -> None:
+    lines = faults("fanuc-sim", "safety.d_min_m=-1", "period_ms=5", "tool=dril", "task.spede=1")
+    assert len(lines) == 4
+    assert all("fanuc-sim.toml: " in line for line in lines)
+
+
+def test_malformed_toml_is_told_with_its_line(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.toml"
+    bad.write_text('name = "x"\nrobot = \n')
+    (line,) = faults(bad)
+    assert f"{bad}:2: malformed TOML" in line
+
+
+def test_unreadable_and_unknown_cells(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    assert "UTF-8" in faults(binary)[0]
+    assert "no such cell file" in faults(tmp_path / "none.toml")[0]
+    assert "did you mean 'fanuc-sim'" in faults("fanuk-sim")[0]
+
+
+def test_a_real_cell_has_neither_ground_truth_nor_simulated_devices() -> None:
+    lines = faults("fanuc-sim", "simulated=false")
+    assert any("ground-truth" in line for line in lines)
+    assert any(": sim: " in line for line in lines)
+
+
+PROFILE = "robots/lrmate_200id/profile.toml"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        ("robots/tools/drill.toml", "mass_kg = 1.6", "mass_kg = 16", ["mass_kg", "16 kg", "payload", "7 kg"]),
+        ("robots/tools/drill.toml", "mass_kg = 1.6", "mass_kg = -1.6", ["mass_kg", "-1.6 kg", "sign"]),
+        ("robots/tools/drill.toml", "inertia = [0.0062,", "inertia = [0.62,", ["inertia", "solid body"]),
+        ("robots/tools/drill.toml", "radius = 0.040", "radius = 40", ["radius", "40 m", "unit"]),
+        (PROFILE, 'link = "j1"', 'link = "j7"', ["capsules[1].link", "'j7'"]),
+        (PROFILE, 'flange = "flange"', 'flange = "flunge"', ["flange", "did you mean 'flange'"]),
+        (PROFILE, '"J1"', '"A1"', ["joints.names[0]", "'A1'", "J1"]),
+        (PROFILE, "[-170, 170]", "[-2.97, 2.97]", ["joints.position_deg[0]", "radians"]),
+        (PROFILE, "[-170, 170]", "[170, -170]", ["joints.position_deg[0]", "lower limit first"]),
+        (PROFILE, "[-170, 170]", "[-180, 180]", ["joints.position_deg[0]", "wider than the URDF"]),
+        (PROFILE, "[450, 380", "[7.85, 380", ["joints.velocity_deg_s[0]", "7.85 deg/s", "unit"]),
+        (PROFILE, "[450, 380", "[-450, 380", ["joints.velocity_deg_s[0]", "sign"]),
+        (PROFILE, "[450, 380, ", "[450, ", ["joints.velocity_deg_s", "5 values for 6 joints"]),
+        (PROFILE, "payload_kg", "payload", ["payload", "unknown key"]),
+        (PROFILE, 'urdf = "lrmate_200id.urdf"', 'urdf = "x.urdf"', ["x.urdf", "No such file"]),
+        ("robots/lrmate_200id/lrmate_200id.urdf", "<link", "<<link", ["lrmate_200id.urdf:", "malformed URDF"]),
+    ],
+)
+def test_a_wrong_robot_or_tool_file_is_told_with_its_name(
+    files: Path, file: str, old: str, new: str, words: list[str]
+) -> None:
+    spoil(files / file, old, new)
+    lines = faults("fanuc-sim")
+    assert any(all(word in line for word in words) and Path(file).name in line for line in lines), lines
+
+
+VALUES = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.lists(st.integers(), max_size=3)
+)
+
+
+@given(table=st.sampled_from(["safety", "human", "task", "control", "realtime", "driver", "bus", "sim"]), value=VALUES)
+def test_no_value_of_a_table_makes_the_loader_raise_anything_else(table: str, value: Any) -> None:
+    faults("fanuc-sim", f"{table}={value!r}")
+
+
+# --- what if ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_if_changes_what_is_asked_and_nothing_else() -> None:
+    params = load_cell("fanuc-sim").params
+    changed = what_if(params, ["safety.d_min_m=0.12"])
+    assert changed.safety == dataclasses.replace(params.safety, d_min=0.12)
+    assert dataclasses.replace(changed, safety=params.safety) == params
+
+
+@pytest.mark.parametrize("change", ["safety.d_min_m=-1", "safety.dmin=1", "task.speed=0.1", "safety=3"])
+def test_what_if_refuses_what_it_cannot_do(change: str) -> None:
+    with pytest.raises(ConfigError):
+        what_if(load_cell("fanuc-sim").params, [change])

@@ -1,0 +1,168 @@
+"""A made-up session: a decision that is cheap and uses most inputs, and the log that it leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from asc_rt.config import load_cell
+from asc_rt.core.params import Params
+from asc_rt.core.types import (
+    CommandKind,
+    CoreState,
+    CycleInputs,
+    CycleOutputs,
+    EventKind,
+    Goal,
+    Health,
+    HumanState,
+    JointCommand,
+    JointState,
+    Mode,
+    OperatorEvent,
+    Pairs,
+    RobotFlag,
+    SafetyDecision,
+    Status,
+    StopReason,
+    vector,
+)
+from asc_rt.record import RecordLayout, Timings
+from drivers.base import WriteReceipt
+from logs import schema
+from logs.log_file import LogFile
+from logs.writer import attachments, session
+
+PERIOD_NS = 8_000_000
+T0_NS = 5_000_000_000
+Cycle = tuple[CoreState, CycleInputs, CycleOutputs, WriteReceipt | None, Timings]
+
+
+def decide(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
+    """Stands in for `step`: pure, quick, and blind to the motor currents, as the real one may be."""
+    q = state.q_cmd + 0.1 * (state.goal.q - state.q_cmd)
+    d = float(np.linalg.norm(x.human.p0)) if x.human else float("inf")
+    column, index = vector([d, d + 1.0]), np.arange(2)
+    pairs = Pairs(
+        robot=index, human=index, basis=index, d=column, d_dot=column, M=column, M_dot=column, phi=column,
+        phi_dot=column, floor=column, achieved=column,
+    )  # fmt: skip
+    armed = any(event.kind is EventKind.ARM for event in x.events)
+    mode = Mode.ACTIVE if armed else state.mode
+    last = any(event.kind is EventKind.END for event in x.events)
+    reason = StopReason.SESSION_END if last else StopReason.NONE
+    decision = SafetyDecision(
+        status=Status.PASS, reason=reason, u_ref=vector(np.sin(x.joint.q)) if x.joint else vector(q), u_safe=vector(q),
+        pairs=pairs, pair_count=2, iterations=x.missed_ticks, share=1.0, d_measured=d,
+    )  # fmt: skip
+    command = JointCommand(x.tick, CommandKind.POSITION, vector(q), vector(q), vector(0 * q), last)
+    after = dataclasses.replace(
+        state, tick=x.tick + 1, mode=mode, reason=reason, q_cmd=vector(q), reached_id=x.tick // 40
+    )
+    return after, CycleOutputs(decision, command, None)
+
+
+def inputs(tick: int, n: int) -> CycleInputs:
+    t_ns = T0_NS + tick * PERIOD_NS
+    rng = np.random.default_rng(tick)
+    q, dq, current = (vector(rng.normal(size=n)) for _ in range(3))
+    joint = JointState(t_ns - 20_000, tick, tick, q, dq, current, RobotFlag.READY, 0, True)
+    m = tick % 3
+    p0, p1, v0, v1 = (vector(rng.normal(size=(m, 3))) for _ in range(4))
+    bound = vector(rng.uniform(0.1, 1.0, size=m))
+    human = HumanState(
+        t_capture_ns=t_ns - 30_000_000, seq=tick, sensor_id=1, calibration_hash=0, health=Health.OK, coverage=1.0,
+        empty_certified=True, p0=p0, p1=p1, v0=v0, v1=v1, radius=bound, position_bound=bound, velocity_bound=bound,
+        visibility=np.zeros(m, np.int64),
+    )  # fmt: skip
+    events = (OperatorEvent(1, EventKind.ARM),) if tick == 2 else ()
+    return CycleInputs(
+        tick, t_ns, PERIOD_NS, joint, human if tick > 1 else None, 30_000_000, False, None, events, 0, False
+    )
+
+
+def run_session(n: int, count: int, end: bool = True) -> list[Cycle]:
+    zero = vector(np.zeros(n))
+    state = CoreState(
+        tick=0, mode=Mode.HOLD, reason=StopReason.NONE, q_cmd=zero, dq_cmd=zero, ddq_cmd=zero,
+        goal=Goal(1, vector(np.ones(n))), reached_id=0, event_id=0, silent_cycles=0, ending=False,
+    )  # fmt: skip
+    cycles: list[Cycle] = []
+    for tick in range(count):
+        x = inputs(tick, n)
+        if end and tick == count - 1:
+            x = dataclasses.replace(x, events=(OperatorEvent(2, EventKind.END),))
+        after, out = decide(state, x)
+        assert out.command is not None
+        receipt = WriteReceipt(x.t_ns + 1_000_000, tick, out.command.q, True)
+        cycles.append((state, x, out, receipt, Timings(x.t_ns - 10_000, x.t_ns, x.t_ns + 500_000, x.t_ns + 600_000)))
+        state = after
+    return cycles
+
+
+class Recording:
+    """Writes sessions to MCAP files the way the logger does."""
+
+    def __init__(self, folder: Path) -> None:
+        self.cell = load_cell("fanuc-sim")
+        self.params: Params = self.cell.params
+        self.layout = RecordLayout(self.params.n)
+        self._names = (folder / f"log{i}.mcap" for i in itertools.count())
+
+    def cycles(self, count: int = 60, **options: Any) -> list[Cycle]:
+        return run_session(self.params.n, count, **options)
+
+    def packed(self, cycles: list[Cycle]) -> list[bytes]:
+        buffer = self.layout.buffer()
+        out = []
+        for cycle in cycles:
+            self.layout.pack(buffer, *cycle)
+            out.append(bytes(buffer))
+        return out
+
+    def write(
+        self,
+        records: list[bytes],
+        messages: list[tuple[schema.Channel, int, dict[str, Any]]] = [],  # noqa: B006
+        wire: bool = True,
+        close: bool = True,
+        fingerprint: dict[str, Any] | None = None,
+    ) -> Path:
+        path = next(self._names)
+        files = attachments(self.cell)
+        if fingerprint is not None:
+            files[schema.FINGERPRINT] = json.dumps(fingerprint).encode()
+        log = LogFile(path, files, session(self.cell))
+        for k, record in enumerate(records):
+            row = np.frombuffer(record, self.layout.dtype)[0]
+            log.message(schema.CYCLE, T0_NS + k * PERIOD_NS, record)
+            if wire:
+                rx, tx = int(row["inputs.joint.t_rx_ns"]), int(row["receipt.t_tx_ns"])
+                log.message(schema.WIRE_RX, rx, schema.wire_message(rx, 3, b"abc"))
+                log.message(schema.WIRE_TX, tx, schema.wire_message(tx, 3, b"xyz"))
+            if k % 6 == 5:
+                log.flush()
+        for channel, t_ns, value in messages:
+            log.json(channel, t_ns, value)
+        log.flush()
+        if close:
+            log.close({"reason": "session closed"})
+        return path
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Recording:
+    return Recording(tmp_path)
+
+
+@pytest.fixture
+def decision() -> Callable[[Params], Any]:
+    """The stepper that made the recordings."""
+    return lambda _: decide
