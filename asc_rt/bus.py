@@ -25,28 +25,22 @@ class BusError(Exception):
         self.hint = hint
 
 
-class Latest:
+class _Inbox:
+    def __init__(self, subscriber: Any) -> None:
+        self._subscriber = subscriber
+
+    def take(self) -> bytes | None:
+        """The next message that was not yet taken, or None. Never waits."""
+        sample = self._subscriber.try_recv()
+        return None if sample is None else bytes(sample.payload.to_bytes())
+
+
+class Latest(_Inbox):
     """Newest message of a key; older ones are forgotten."""
 
-    def __init__(self, subscriber: Any) -> None:
-        self._subscriber = subscriber
 
-    def take(self) -> bytes | None:
-        """The newest message not yet taken, or None."""
-        sample = self._subscriber.try_recv()
-        return None if sample is None else bytes(sample.payload.to_bytes())
-
-
-class Queue:
+class Queue(_Inbox):
     """All messages of a key, in order."""
-
-    def __init__(self, subscriber: Any) -> None:
-        self._subscriber = subscriber
-
-    def take(self) -> bytes | None:
-        """The oldest message not yet taken, or None."""
-        sample = self._subscriber.try_recv()
-        return None if sample is None else bytes(sample.payload.to_bytes())
 
 
 class Publisher:

@@ -58,8 +58,8 @@ def _check_joint(path: Path, i: int, limits: tuple[float, float], joint: ET.Elem
 
 def check_profile(path: Path, profile: ProfileFile, faults: Faults) -> None:
     joints, n = profile.joints, len(profile.joints.names)
-    for key in ("position_deg", "velocity_deg_s", "acceleration_deg_s2", "jerk_deg_s3"):
-        if (count := len(getattr(joints, key))) != n:
+    for key in ("position_deg", "velocity_deg_s", "acceleration_deg_s2", "jerk_deg_s3", "effort_nm"):
+        if (values := getattr(joints, key)) is not None and (count := len(values)) != n:
             faults.note(path, f"joints.{key}", f"{count} values for {n} joints; one each for {', '.join(joints.names)}")
     for i, (low, high) in enumerate(joints.position_deg):
         key = f"joints.position_deg[{i}]"

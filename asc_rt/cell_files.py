@@ -64,6 +64,7 @@ class Task(Table):
 
 
 class Control(Table):
+    level: Literal["acceleration", "torque"] = "acceleration"  # what the robot takes: positions, or torques
     silence_cycles: Annotated[int, _integer(1, 125)]
     tracking_tolerance_deg: Annotated[float, _number(0.5, 45.0)]
 
@@ -75,6 +76,9 @@ class RealTime(Table):
 
 class Log(Table):
     dir: Text = "runs"
+    key: str = ""  # file of the key that seals recordings; "": the user's own, made at first use
+    on_full: Literal["finish", "stop"] = "stop"  # the disk takes no more: finish the session unrecorded, or stop it
+    rotate_min: Annotated[float, _number(0, 1440)] = 0.0  # minutes in one file; 0: all
 
 
 class CellFile(Table):
@@ -111,6 +115,7 @@ class Joints(Table):
     velocity_deg_s: list[Annotated[float, _number(15, 3000)]]
     acceleration_deg_s2: list[Annotated[float, _number(60, 100000)]]
     jerk_deg_s3: list[Annotated[float, _number(600, 10000000)]]
+    effort_nm: list[Annotated[float, _number(0.1, 10000)]] | None = None  # torque-controlled arms only
     provenance: Provenance
 
 

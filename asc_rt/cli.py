@@ -18,6 +18,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from logs import commands
+
 DEFAULT_CELL = "fanuc-sim"
 BAD_INPUT = 2
 
@@ -97,46 +99,37 @@ def sim(
 
 
 @app.command()
-def replay(
-    log: Path,
-    start: Annotated[int, typer.Option("--from", help="number of the first cycle to run again", metavar="N")] = 0,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="what if: another value of [safety]")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Run every recorded decision again and compare the bytes. Example: asc replay runs/LOG.mcap"""
-    _limit_blas()
-    from functools import partial
-
-    from tqdm import tqdm
-
-    from asc_rt.config import what_if
-    from logs.reader import open_log
-    from logs.replay import replay as replay_log
-
-    params = what_if(open_log(log).params, overrides) if overrides else None
-    try:
-        report = replay_log(log, start, params=params, progress=partial(tqdm, unit=" cycles", disable=None))
-    except IndexError as error:
-        _refuse(f"--from: {error}")
-    _show(report.as_dict(), as_json)
-    holds = report.mismatches == 0 and report.wire_mismatches == 0
-    raise typer.Exit(0 if holds or overrides else 1)
-
-
-@app.command()
 def view(
-    log: Path,
+    log: Annotated[
+        Path | None, typer.Argument(metavar="LOG", help="recording; with --live the cell, if not the newest")
+    ] = None,
+    live: Annotated[bool, typer.Option("--live", help="the running cell instead of a recording")] = False,
     save: Annotated[Path | None, typer.Option(help="write a .rrd file instead of opening the viewer")] = None,
-    shot: Annotated[Path | None, typer.Option(help="write a picture, .png")] = None,
-    at: Annotated[float | None, typer.Option(help="moment of the picture, seconds", metavar="S")] = None,
-    web: Annotated[bool, typer.Option("--web", help="serve the viewer to a browser")] = False,
+    shot: Annotated[Path | None, typer.Option(help="write a picture, .png; needs no display")] = None,
+    at: Annotated[
+        float | None, typer.Option(help="moment of the picture, seconds; default: the nearest approach", metavar="S")
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="serve the viewer to a browser on this machine")] = False,
+    overrides: Overrides = None,
 ) -> None:
-    """Open a recording in Rerun. Example: asc view runs/LOG.mcap"""
-    from logs.view import view as view_log
+    """Open a recording, or the running cell, in Rerun. Example: asc view runs/latest.mcap"""
+    if not live:
+        from logs.view import view as view_log
 
-    view_log(log, save=save, shot=shot, at=at, web=web)
+        if log is None:
+            _refuse("LOG is missing: name a recording, or --live for the running cell")
+        if overrides:
+            _refuse("--set belongs to --live: a recording carries its own values")
+        view_log(log, save=save, shot=shot, at=at, web=web)
+        return
+    from asc_rt.config import load_cell
+    from logs.view_live import live as view_live
+    from logs.view_live import newest_ring
+
+    if save or shot or at is not None:
+        _refuse("--live can be neither saved nor shot: use the recording")
+    ring, name = newest_ring()
+    view_live(load_cell(str(log or name), overrides or []).params, ring, web)
 
 
 @app.command()
@@ -256,6 +249,8 @@ def _limit_blas() -> None:
 
     realtime.one_blas_thread()
 
+
+commands.register(app, _show, _refuse, lambda: _limit_blas())
 
 if __name__ == "__main__":
     main()

@@ -43,6 +43,13 @@ class RealTimeOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class LogOptions:
+    key: Path | None  # None: the user's own
+    stop_when_full: bool
+    rotate_ns: int  # 0: one file
+
+
+@dataclass(frozen=True, slots=True)
 class Cell:
     name: str
     path: Path
@@ -55,6 +62,7 @@ class Cell:
     bus_endpoint: str
     goals: tuple[tuple[float, ...], ...]  # rad
     log_dir: Path
+    log: LogOptions
     realtime: RealTimeOptions
 
     @property
@@ -92,6 +100,24 @@ def load_cell(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Cell:
         raise ConfigError(faults)
     params = _params(cell, profile, tool, urdf, calibration)
     return _assemble(path, text, overrides, cell, params)
+
+
+def load_arm(robot: str, tool: str) -> tuple[RobotParams, ToolParams]:
+    """A robot of asc_rt/robots and a tool of asc_rt/robots/tools, without a cell. ConfigError: all that is wrong."""
+    faults, asked = Faults(), Path("command line")
+    profile = _part(ProfileFile, asked, "robot", robot, faults)
+    tool_file = _part(ToolFile, asked, "tool", tool, faults)
+    if profile is None or tool_file is None:
+        raise ConfigError(faults)
+    profile_path = _part_path("robot", robot)
+    urdf_path = profile_path.parent / profile.urdf
+    urdf = _read(urdf_path)
+    checks.check_profile(profile_path, profile, faults)
+    checks.check_urdf(profile_path, profile, urdf_path, urdf, faults)
+    checks.check_tool(_part_path("tool", tool), tool_file, profile, faults)
+    if faults:
+        raise ConfigError(faults)
+    return _robot(profile, urdf), _tool(tool_file, profile.flange)
 
 
 def what_if(params: Params, changes: Sequence[str]) -> Params:
@@ -235,18 +261,23 @@ def _assemble(path: Path, text: str, overrides: Sequence[str], cell: CellFile, p
         bus_endpoint=cell.bus.endpoint,
         goals=tuple(_radians(goal) for goal in cell.task.goals_deg),
         log_dir=Path(cell.log.dir),
+        log=LogOptions(
+            key=path.resolve().parent / cell.log.key if cell.log.key else None,
+            stop_when_full=cell.log.on_full == "stop",
+            rotate_ns=round(cell.log.rotate_min * 60e9),
+        ),
         realtime=RealTimeOptions(cell.realtime.priority, None if cell.realtime.cpu < 0 else cell.realtime.cpu),
     )
 
 
 def _params(cell: CellFile, profile: ProfileFile, tool: ToolFile, urdf: str, calibration: int) -> Params:
-    capsules = tuple(_capsule(profile.flange, c) for c in tool.capsules)
     return Params(
         period_ns=cell.period_ms * 1_000_000,
+        control=cell.control.level,
         silence_cycles=cell.control.silence_cycles,
         tracking_tolerance=math.radians(cell.control.tracking_tolerance_deg),
         robot=_robot(profile, urdf),
-        tool=ToolParams(tool.name, tool.mass_kg, tool.com, tool.inertia, capsules),
+        tool=_tool(tool, profile.flange),
         safety=_safety(cell.safety),
         human=HumanParams(_ns(cell.human.age_limit_ms), _ns(cell.human.future_limit_ms), calibration),
         task=TaskParams(cell.task.speed, math.radians(cell.task.goal_tolerance_deg)),
@@ -277,9 +308,15 @@ def _robot(profile: ProfileFile, urdf: str) -> RobotParams:
         dq_max=_radians(joints.velocity_deg_s),
         ddq_max=_radians(joints.acceleration_deg_s2),
         dddq_max=_radians(joints.jerk_deg_s3),
+        effort=tuple(joints.effort_nm or ()),
         command_latency_ns=_ns(profile.command_latency_ms),
         capsules=tuple(_capsule(c.link, c) for c in profile.capsules),
     )
+
+
+def _tool(tool: ToolFile, flange: str) -> ToolParams:
+    capsules = tuple(_capsule(flange, capsule) for capsule in tool.capsules)
+    return ToolParams(tool.name, tool.mass_kg, tool.com, tool.inertia, capsules)
 
 
 def _capsule(link: str, capsule: Capsule) -> CapsuleSpec:

@@ -28,6 +28,7 @@ from asc_rt.cycle import run
 from asc_rt.inputs import Mail
 from asc_rt.record import RecordError, RecordLayout, Timings
 from asc_rt.ring import RingError, RingWriter, wire_path, wire_tap
+from asc_rt.robot_limits import within
 from drivers import registry
 from drivers.base import DriverCaps, DriverError, HandshakeError, RobotDriver, RobotFaulted, WriteReceipt
 
@@ -94,13 +95,27 @@ def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder
     try:
         caps = driver.configure()
         _check(caps, system)
+        system = System(within(cell.params, caps.limits))  # the smaller of the profile's and the robot's own limits
+        warm_up(system)
         report = realtime.set_up(cell.realtime.priority, cell.realtime.cpu)
         driver.activate(cell.params.period_ns)
-        tell({"event": "start", "pid": os.getpid(), "robot": caps.identity, "realtime": report})
+        decided_with = system.params.canonical().decode()
+        tell(
+            {
+                "event": "start",
+                "pid": os.getpid(),
+                "robot": caps.identity,
+                "realtime": report,
+                "params": decided_with,
+            }
+        )
         code = FAILED
         pacer = pacing.make(caps.pacing, cell.params.period_ns)
         state = run(system, driver, mail, recorder, pacer, time.monotonic_ns)
         end = {"mode": state.mode.name, "reason": state.reason.name}
+        if (fault := driver.fault) is not None:
+            _complain(fault)
+            end |= {"error": str(fault), "hint": fault.hint}
         code = COMPLETED if state.mode is Mode.ENDED else FAILED
     except DriverError as error:
         _complain(error)

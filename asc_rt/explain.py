@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import types
 import typing
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +14,7 @@ from pydantic.fields import FieldInfo
 # Longest suffix first: d_min_m ends in _m, velocity_m_s in _m_s.
 UNITS = {
     "_deg_s3": "deg/s3", "_deg_s2": "deg/s2", "_deg_s": "deg/s", "_deg": "deg", "_m_s2": "m/s2", "_m_s": "m/s",
-    "_ms": "ms", "_kg": "kg", "_hz": "Hz", "_m": "m",
+    "_nm": "Nm", "_ms": "ms", "_kg": "kg", "_hz": "Hz", "_m": "m",
 }  # fmt: skip
 METRES = ("p0", "p1", "radius", "com")
 
@@ -83,7 +84,10 @@ def _annotation(field: FieldInfo) -> Any:
 
 
 def _bare(kind: Any) -> Any:
-    return typing.get_args(kind)[0] if typing.get_origin(kind) is typing.Annotated else kind
+    """Without rules, and without "or None"."""
+    if typing.get_origin(kind) in (typing.Annotated, types.UnionType):
+        return _bare(typing.get_args(kind)[0])
+    return kind
 
 
 def _right(model: type[BaseModel], path: Sequence[Any], unit: str) -> str:

@@ -118,11 +118,15 @@ class Processes:
             process.popen.kill()
             process.popen.wait()
 
-    def end_all(self) -> None:
-        """Control first, so that the robot rests before anything else goes; the logger last: its file is then whole."""
-        others = [name for name in self._running if name not in ("control", "logger")]
-        for name in ("control", *others, "logger"):
+    def end_all_but_logger(self) -> None:
+        """The control process first, so that the robot rests before anything else goes."""
+        for name in sorted(self._running.keys() - {"logger"}, key=lambda name: name != "control"):
             self.end(name)
+
+    def end_logger(self) -> None:
+        """It ends by itself once the ring is closed. A signal would hit it while it leaves, and look like a failure."""
+        self.wait("logger", END_TIMEOUT_S["logger"])
+        self.end("logger")
 
 
 def run_device(cell: Cell, device: str, options: Sequence[str]) -> int:

@@ -5,7 +5,7 @@ protobuf `asc.v1.CycleRecord`), the numpy dtype that reads them back as columns,
 tool read them.
 
 The record ends in a CRC-32 of all that is before it, so that a changed byte is found even where no output depends on it
-(see `logs.diff.altered`).
+(see `logs.diff.altered`). The logger writes it, `seal`: the loop has no time for it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,6 @@ from asc_rt.fixed_protobuf import (
     tag,
 )
 from asc_rt.inputs import MAX_EVENTS
-from asc_rt.ring import RingWriter
 from drivers.base import WriteReceipt
 
 NAME = f"{PACKAGE}.CycleRecord"
@@ -197,7 +196,9 @@ class RecordLayout:
 
     def buffer(self) -> bytearray:
         """Room for one record, to be used again and again."""
-        return bytearray(self.size)
+        made = bytearray(self.size)
+        made[self._checked : self._check_offset] = self._check_tag
+        return made
 
     def pack(
         self,
@@ -208,14 +209,13 @@ class RecordLayout:
         receipt: WriteReceipt | None,
         timings: Timings,
     ) -> None:
-        """Write one whole record. RecordError: something does not fit; `into` is then no record."""
+        """Write one whole record, but not its check, into what `buffer` gave. RecordError: something does not fit;
+        `into` is then no record."""
         for part, obj in zip(self._parts, (before, inputs, outputs, receipt, timings), strict=True):
             part.pack_into(into, obj)
-        self.seal(into)
 
     def seal(self, record: bytearray | memoryview) -> None:
         """Write the check that belongs to the bytes before it."""
-        record[self._checked : self._check_offset] = self._check_tag
         struct.pack_into("<I", record, self._check_offset, zlib.crc32(memoryview(record)[: self._checked]))
 
     def syndrome(self, record: Buffer) -> int:
@@ -232,30 +232,6 @@ class RecordLayout:
 
     def unpack_rest(self, record: Buffer) -> tuple[WriteReceipt | None, Timings]:
         return self.parts["receipt"].unpack(record), self.parts["timings"].unpack(record)
-
-
-class CycleRecorder:
-    """Packs cycles and hands them to a ring: what the loop sees of the logger."""
-
-    def __init__(self, layout: RecordLayout, ring: RingWriter) -> None:
-        self._pack, self._put, self._buffer = layout.pack, ring.put, layout.buffer()
-        self.dropped = 0  # cycles that did not fit into the record; the gap in the ticks shows them in the log
-
-    def put(
-        self,
-        before: CoreState,
-        inputs: CycleInputs,
-        outputs: CycleOutputs,
-        receipt: WriteReceipt | None,
-        timings: Timings,
-    ) -> None:
-        """Keep one cycle. Never waits, never raises: a fault of the record must not stop the braking of the robot."""
-        try:
-            self._pack(self._buffer, before, inputs, outputs, receipt, timings)
-        except RecordError:
-            self.dropped += 1
-            return
-        self._put(self._buffer)
 
 
 def file_descriptor_set() -> descriptor_pb2.FileDescriptorSet:

@@ -2,8 +2,9 @@
 
 The file is made by the supervisor and never removed by the producer: whatever dies, what was put stays readable.
 A slot is [sequence u64 | length u64 | payload], padded to 64 bytes. The producer writes sequence 0, the payload, the
-sequence k + 1 and then the head; the reader takes a slot only if it finds k + 1 before and after copying. Every one of
-these words is one aligned 8-byte store. That order holds on x86 (stores are not reordered); ARM would need a barrier.
+sequence k + 1 and then the head; the reader looks at a slot below the head and takes its copy only if it finds k + 1
+afterwards: had the producer begun to overwrite it, it would find another number. Every one of these words is one
+aligned 8-byte store. That order holds on x86 (stores are not reordered); ARM would need a barrier.
 
 The producer never waits: a reader that is slower than the ring is deep loses the oldest slots and counts them.
 """
@@ -60,16 +61,16 @@ def create(path: str | Path, slot_size: int, slots: int) -> None:
 class _Ring:
     """The mapped file. RingError: not a ring."""
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, writable: bool = True) -> None:
         try:
-            fd = os.open(path, os.O_RDWR)
+            fd = os.open(path, os.O_RDWR if writable else os.O_RDONLY)
         except OSError as error:
             raise RingError(f"{path}: {error.strerror}", hint="the ring is made by the session's supervisor") from error
         try:
             size = os.fstat(fd).st_size
             if size < HEADER_SIZE:
                 raise RingError(f"{path}: not a ring")
-            self._map = mmap.mmap(fd, size)
+            self._map = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ)
         finally:
             os.close(fd)
         self._bytes = memoryview(self._map)
@@ -94,6 +95,14 @@ class _Ring:
     def closed(self) -> bool:
         """The producer has said that nothing follows."""
         return self._words[_CLOSED] != 0
+
+    def _slot(self, index: int) -> bytes | None:
+        """A copy of slot `index`; None: overwritten before or while it was copied."""
+        offset = HEADER_SIZE + index % self.slots * self._stride
+        word = offset >> 3
+        size = min(self._words[word + 1], self.slot_size)
+        payload = bytes(self._bytes[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size])
+        return payload if self._words[word] == index + 1 else None
 
     def _unmap(self) -> None:
         self._words.release()
@@ -149,22 +158,11 @@ class RingReader(_Ring):
 
     def take(self) -> bytes | None:
         """The oldest payload not yet taken, or None."""
-        words = self._words
-        while self._next < words[_HEAD]:
-            behind = words[_HEAD] - self._next - self.slots
-            if behind > 0:  # the producer has lapped us
-                words[_LOST] += behind
-                self._next += behind
-            index = self._next
-            offset = HEADER_SIZE + index % self.slots * self._stride
-            word = offset >> 3
+        while self._next < self.head:
             self._next += 1
-            if words[word] == index + 1:
-                size = min(words[word + 1], self.slot_size)
-                payload = bytes(self._bytes[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size])
-                if words[word] == index + 1:
-                    return payload
-            words[_LOST] += 1  # overwritten while we looked
+            if (payload := self._slot(self._next - 1)) is not None:
+                return payload
+            self._words[_LOST] += 1
         return None
 
     def drain(self) -> Iterator[bytes]:
@@ -180,6 +178,21 @@ class RingReader(_Ring):
     def finished(self) -> bool:
         """Closed by the producer, and all taken."""
         return self.closed and self._next >= self.head
+
+
+class RingWatcher(_Ring):
+    """Looks on beside the consumer, any number of them. The ring is mapped read-only: nobody can notice."""
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(path, writable=False)
+        self._next = 0
+
+    def new(self) -> list[bytes]:
+        """What was put since the last look and is still there; the first time all that is there."""
+        head = self.head
+        seen = [self._slot(index) for index in range(max(self._next, head - self.slots), head)]
+        self._next = head
+        return [payload for payload in seen if payload is not None]
 
 
 def _stride(slot_size: int) -> int:

@@ -18,7 +18,7 @@ from asc_rt.bus import Bus, open_router
 from asc_rt.config import Cell
 from asc_rt.console import Keyboard, Operator
 from asc_rt.core.types import EventKind
-from asc_rt.processes import Death, Process, Processes, describe, table
+from asc_rt.processes import Death, Process, Processes, Spec, describe, table
 from asc_rt.record import RecordLayout
 
 READY_TIMEOUT_S = 60.0  # of one process, compiling included
@@ -72,7 +72,9 @@ def run_cell(cell: Cell, log: Path, duration_s: float | None) -> Session:
         try:
             _Supervisor(cell, bus, processes, session, interrupts).run(ring_path, duration_s)
         finally:
-            processes.end_all()
+            processes.end_all_but_logger()
+            ring.RingWriter(ring_path).close()  # on behalf of a control process that was killed
+            processes.end_logger()
             session.control_code = processes.code("control")
             for number, handler in old.items():
                 signal.signal(number, handler)
@@ -103,20 +105,29 @@ class _Supervisor:
     # --- start -------------------------------------------------------------------------------------------------------
 
     def _start(self, ring_path: Path) -> None:
-        """One process after the other, each when the one before can be used; the control process last."""
-        for spec in table(self._cell, ring_path, self._session.log).values():
-            print(f"start {spec.name}", file=sys.stderr)
-            self._processes.start(spec)
-            deadline = time.monotonic() + READY_TIMEOUT_S
-            while not self._is_ready(spec.name):
-                if (code := self._processes.code(spec.name)) is not None:
-                    raise StartError(f"{spec.name} did not start: {describe(code)}")
-                if self._interrupts:
-                    raise StartError(f"interrupted while {spec.name} was starting")
-                if time.monotonic() > deadline:
-                    raise StartError(f"{spec.name} is not ready after {READY_TIMEOUT_S:g} s")
-                time.sleep(POLL_S)
+        """Everything that the control process relies on, then the control process."""
+        specs = table(self._cell, ring_path, self._session.log)
+        control = specs.pop("control")
+        self._start_and_await(*specs.values())
+        self._start_and_await(control)
         self._session.started = True
+
+    def _start_and_await(self, *specs: Spec) -> None:
+        """Start these together; StartError if one ends or does not become ready."""
+        print(f"start {', '.join(spec.name for spec in specs)}", file=sys.stderr)
+        for spec in specs:
+            self._processes.start(spec)
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        waiting = [spec.name for spec in specs]
+        while waiting := [name for name in waiting if not self._is_ready(name)]:
+            for name in waiting:
+                if (code := self._processes.code(name)) is not None:
+                    raise StartError(f"{name} did not start: {describe(code)}")
+            if self._interrupts:
+                raise StartError(f"interrupted while {' and '.join(waiting)} started")
+            if time.monotonic() > deadline:
+                raise StartError(f"not ready after {READY_TIMEOUT_S:g} s: {', '.join(waiting)}")
+            time.sleep(POLL_S)
 
     def _is_ready(self, name: str) -> bool:
         if name == "logger":

@@ -1,8 +1,9 @@
 """The hardware abstraction layer: what a robot driver is.
 
 Life of a driver: configure() -> activate() -> read() / write() each cycle -> stop() -> close().
-A driver turns bytes into `JointState` and `JointCommand` into bytes, in SI units and radians, and nothing else: it starts
-no thread, retries nothing, recovers from nothing and limits nothing. Recovery is policy (`asc_rt.core.mode`) plus a person.
+A driver turns bytes into `JointState` and `JointCommand` into bytes, in SI units and radians, and nothing else: it
+starts no thread, retries nothing, recovers from nothing and limits nothing (it may refuse what its robot would refuse).
+Recovery is policy (`asc_rt.core.mode`) plus a person.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, StopRequest, Vector
 
@@ -18,6 +19,15 @@ from asc_rt.core.types import CommandKind, JointCommand, JointState, StopRequest
 class Pacing(StrEnum):
     DEVICE = "device"  # the robot's samples set the rhythm: read() waits for the next
     HOST = "host"  # this PC sets the rhythm: read() returns the newest sample
+
+
+@dataclass(frozen=True, slots=True)
+class JointLimits:
+    """What the robot itself says that its joints may do; set-points inside this box raise no alarm there."""
+
+    dq_max: Vector  # (n,) rad/s
+    ddq_max: Vector  # (n,) rad/s2
+    dddq_max: Vector  # (n,) rad/s3
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +39,7 @@ class DriverCaps:
     kinds: frozenset[CommandKind]
     period_ns: int  # nominal
     identity: str  # model, protocol, version as the device tells them
+    limits: JointLimits | None = None  # None: it tells none; the profile's are all there is
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +87,22 @@ class OwnershipError(DriverError):
 WireTap = Callable[[str, int, bytes], None]  # (direction "rx" or "tx", t_ns, raw bytes): for the record
 
 
+@runtime_checkable
+class ReplayCodec(Protocol):
+    """A driver's codec without its link, to check a recording. Optional: a driver that has these two methods."""
+
+    def decode_sample(self, data: bytes) -> tuple[int, Vector, Vector] | None:
+        """(sequence, q, current) of a received packet, as `read` tells them; None: a packet of another kind."""
+
+    def encode_set_point(self, seq: int, q: Vector, last: bool) -> bytes:
+        """The packet that `write` sends for it."""
+
+
 class RobotDriver(Protocol):
+    fault: RobotFaulted | None  # why the robot left the session, as far as it tells; complete after stop()
+
     def __init__(self, options: dict[str, Any], tap: WireTap | None = None) -> None:
-        """`options`: the cell's [driver] table without `name`. Opens nothing. Raises ValueError naming a wrong option."""
+        """`options`: the cell's [driver] table without `name`. Opens nothing. ValueError names a wrong option."""
 
     def configure(self) -> DriverCaps:
         """Open the link and read the robot's identity. Nothing can move yet."""
@@ -90,7 +114,7 @@ class RobotDriver(Protocol):
         """The next sample (Pacing.DEVICE) or the newest (Pacing.HOST); None at the deadline: silence."""
 
     def write(self, command: JointCommand) -> WriteReceipt:
-        """Send one command, now."""
+        """Send one command, now. ProtocolError: the robot would take it as an offence, so it was not sent."""
 
     def stop(self, request: StopRequest | None = None) -> None:
         """Leave the session so that the robot stays or comes to rest. From any state, idempotent, never raises."""

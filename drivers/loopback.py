@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, StopRequest, Vector, vector
-from drivers.base import DriverCaps, HandshakeError, LinkError, Pacing, WireTap, WriteReceipt
+from drivers.base import DriverCaps, HandshakeError, LinkError, Pacing, RobotFaulted, WireTap, WriteReceipt
 
 FAULTS = ("none", "silence", "raise", "nan")
 
@@ -30,6 +30,7 @@ class Loopback:
         if not isinstance(self._fault_after, int) or self._fault_after < 0:
             raise ValueError(f"loopback: fault_after must be a count of reads, not {self._fault_after!r}")
         self._tap = tap
+        self.fault: RobotFaulted | None = None
         self._active = False
         self._reset()
 
@@ -41,14 +42,19 @@ class Loopback:
 
     def configure(self) -> DriverCaps:
         return DriverCaps(
-            dof=len(self._start), pacing=Pacing.HOST, kinds=frozenset({CommandKind.POSITION}),
-            period_ns=self._period_ns, identity="loopback",
+            dof=len(self._start),
+            pacing=Pacing.HOST,
+            kinds=frozenset({CommandKind.POSITION}),
+            period_ns=self._period_ns,
+            identity="loopback",
         )
 
     def activate(self, period_ns: int) -> JointState:
         if period_ns != self._period_ns:
-            raise HandshakeError(f"the loopback's period is {self._period_ns} ns, the cell's {period_ns} ns",
-                                 hint="make the cell's period and the driver's period_ms equal")
+            raise HandshakeError(
+                f"the loopback's period is {self._period_ns} ns, the cell's {period_ns} ns",
+                hint="make the cell's period and the driver's period_ms equal",
+            )
         self._reset()
         self._active = True
         return self._sample(self._q)
@@ -90,8 +96,15 @@ class Loopback:
         if self._tap is not None:
             self._tap("rx", t_ns, q.tobytes())
         return JointState(
-            t_rx_ns=t_ns, t_device_ns=t_ns, seq=self._seq, q=q, dq=self._dq, current=vector(np.zeros_like(q)),
-            flags=RobotFlag.READY | RobotFlag.SERVO_ON, tool_id=0, dq_is_estimated=True,
+            t_rx_ns=t_ns,
+            t_device_ns=t_ns,
+            seq=self._seq,
+            q=q,
+            dq=self._dq,
+            current=vector(np.zeros_like(q)),
+            flags=RobotFlag.READY | RobotFlag.SERVO_ON,
+            tool_id=0,
+            dq_is_estimated=True,
         )
 
 

@@ -25,8 +25,10 @@ class OwnerLock:
         try:
             fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise LinkError(f"cannot open the lock file {self._path}: {error.strerror}",
-                            hint="give the driver another lock_dir or remove that file") from error
+            raise LinkError(
+                f"cannot open the lock file {self._path}: {error.strerror}",
+                hint="give the driver another lock_dir or remove that file",
+            ) from error
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

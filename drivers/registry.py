@@ -12,6 +12,7 @@ GROUP = "asc.drivers"  # entry points of installed packages: name = "module:Clas
 
 BUILTIN = {
     "fanuc-j519": "drivers.fanuc_stream_motion.link:StreamMotion",
+    "fanuc-stream-motion-b": "drivers.fanuc_stream_motion.link_b:StreamMotionB",
     "loopback": "drivers.loopback:Loopback",
 }
 

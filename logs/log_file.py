@@ -1,4 +1,4 @@
-"""One MCAP file being written: attachments and schemas first, then messages, each flush made durable."""
+"""One MCAP file being written: attachments and schemas first, then messages and seals; each flush is durable."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import hashlib
 import json
 import os
 import time
+import uuid
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import CompressionType, Writer
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from logs import schema
+from logs import schema, seal
+from logs.mcap_writer import Appender, McapWriter
+
+SEAL_NS = 1_000_000_000
 
 
 class LogFile:
@@ -24,60 +28,100 @@ class LogFile:
         attachments: Mapping[str, bytes],
         session: Mapping[str, str],
         channels: Iterable[schema.Channel] = schema.CHANNELS,
+        key: Ed25519PrivateKey | None = None,
     ) -> None:
-        """FileExistsError: recordings are never overwritten."""
-        self.path = Path(path)
-        self._stream = open(path, "xb")  # noqa: SIM115 (closed by close(); left open by a crash, as it should be)
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
+        """`key`: signs the seals; None: no seals. FileExistsError: recordings are never overwritten."""
+        self.path, self.session_id = Path(path), uuid.uuid4().hex
+        self._key = key
+        self._sealer = None if key is None else seal.Sealer(key, self.session_id)
+        self._file = Appender(self.path, os.O_CREAT | os.O_EXCL)
+        self._writer = McapWriter(self._file)
         self._writer.start(profile=schema.PROFILE, library=schema.LIBRARY)
         # Monotonic stamps are moved to wall-clock time by one constant, so that viewers show when it happened.
         self._wall_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
-        hashes = {f"sha256 {name}": hashlib.sha256(data).hexdigest() for name, data in attachments.items()}
-        offset = {"wall_minus_monotonic_ns": str(self._wall_minus_monotonic_ns)}
-        self._writer.add_metadata(schema.SESSION, {**session, **offset, **hashes})
-        for name, data in attachments.items():
-            now = time.time_ns()
-            self._writer.add_attachment(now, now, name, _media_type(name), data)
+        self._write_head(attachments, session)
         self._schemas: dict[str, int] = {"": 0}
         self._channels = {channel.topic: self._register(channel) for channel in channels}
         self._counts = dict.fromkeys(self._channels, 0)
-        # The library writes schemas with the first chunk only: make this one now, and small.
+        # Schemas are written with the first chunk: make this one now, and small.
         self.json(schema.HELLO, time.monotonic_ns(), dict(session))
+        self._next_seal_ns = 0
         self.flush()
+
+    def _write_head(self, attachments: Mapping[str, bytes], session: Mapping[str, str]) -> None:
+        hashes = {f"sha256 {name}": hashlib.sha256(data).hexdigest() for name, data in attachments.items()}
+        own = {"wall_minus_monotonic_ns": str(self._wall_minus_monotonic_ns), seal.SESSION_ID: self.session_id}
+        if self._key is not None:
+            own[seal.PUBLIC_KEY] = seal.raw_hex(self._key.public_key())
+        self._writer.metadata(schema.SESSION, {**session, **own, **hashes})
+        for name, data in attachments.items():
+            self._writer.attachment(time.time_ns(), name, _media_type(name), data)
 
     def _register(self, channel: schema.Channel) -> int:
         if channel.schema_name not in self._schemas:
-            self._schemas[channel.schema_name] = self._writer.register_schema(
+            self._schemas[channel.schema_name] = self._writer.schema(
                 channel.schema_name, channel.schema_encoding, channel.schema_data
             )
-        return self._writer.register_channel(channel.topic, channel.encoding, self._schemas[channel.schema_name])
+        return self._writer.channel(channel.topic, channel.encoding, self._schemas[channel.schema_name])
+
+    @property
+    def sha256(self) -> str:
+        """Of all bytes in the file."""
+        return self._file.sha.hexdigest()
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._file.size
 
     def message(self, channel: schema.Channel, t_ns: int, data: bytes) -> None:
         """Add a message of monotonic time `t_ns`."""
-        time_ns = max(0, t_ns + self._wall_minus_monotonic_ns)
         topic = channel.topic
-        self._writer.add_message(self._channels[topic], time_ns, data, time_ns, self._counts[topic])
+        time_ns = max(0, t_ns + self._wall_minus_monotonic_ns)
+        self._writer.message(self._channels[topic], self._counts[topic], time_ns, data)
         self._counts[topic] += 1
+
+    def wall_ns(self, t_ns: int) -> int:
+        """Wall-clock time of the monotonic time `t_ns`, as the file has it."""
+        return max(0, t_ns + self._wall_minus_monotonic_ns)
 
     def json(self, channel: schema.Channel, t_ns: int, value: Mapping[str, Any]) -> None:
         self.message(channel, t_ns, json.dumps(value).encode())
 
     def flush(self) -> None:
-        """All messages so far survive the death of this process and of the machine."""
+        """All messages so far survive the death of this process and of the machine; about each second they are
+        sealed."""
         self._writer.flush()
-        os.fdatasync(self._stream.fileno())
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._next_seal_ns:
+            self._seal()
+            self._next_seal_ns = now_ns + SEAL_NS
+        self._file.sync()
+
+    def _seal(self, final: bool = False) -> None:
+        if self._sealer is not None:
+            self._writer.metadata(*self._sealer.seal(self._file.size, self.sha256, final))
 
     def close(self, end: Mapping[str, str]) -> None:
-        """Write how the recording ended and the index; nothing can follow."""
-        counts = {f"messages {topic}": str(count) for topic, count in self._counts.items()}
+        """Write how the recording ended, the last seal and the index; nothing can follow."""
+        self._file.release()
         self._writer.flush()
-        self._writer.add_metadata(schema.END, {**end, **counts})
+        counts = {f"messages {topic}": str(count) for topic, count in self._counts.items()}
+        self._writer.metadata(schema.END, {**end, **counts})
+        self._seal(final=True)
         self._writer.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._stream.close()
+        if self._key is not None:
+            seal.sign_file(self.path, self._key, self.session_id, self.size, self.sha256)
+
+    def abandon(self) -> None:
+        """The disk takes nothing more: leave the file as a crash would, whole up to its last record."""
+        self._file.close()
+
+    def forget(self) -> None:
+        """Throw away the messages that could not be written."""
+        self._writer.forget()
 
 
 def _media_type(name: str) -> str:
-    types = {".json": "application/json", ".toml": "application/toml", ".urdf": "application/xml"}
+    types = {".json": "application/json", ".toml": "application/toml", ".urdf": "application/xml", ".txt": "text/plain"}
     return types.get(Path(name).suffix, "application/octet-stream")

@@ -79,6 +79,7 @@ class Extent:
     """How far a file is whole."""
 
     complete_bytes: int = len(MAGIC)  # up to here every record is complete
+    data_bytes: int = len(MAGIC)  # the same without index and footer
     closed: bool = False  # the file was closed: index, footer and all checksums are right
 
 
@@ -105,7 +106,7 @@ def frames(data: Bytes, name: str, extent: Extent) -> Iterator[Raw]:
             _check_attachment(data, name, raw)
         yield raw
         crc = zlib.crc32(data[at : raw.end], crc)
-        at = extent.complete_bytes = raw.end
+        at = extent.complete_bytes = extent.data_bytes = raw.end
 
 
 def _frame(data: Bytes, name: str, at: int) -> Raw | None:

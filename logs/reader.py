@@ -1,4 +1,4 @@
-"""Open a recording: every checksum checked, cycles by number, messages by topic.
+"""Open a recording: every checksum and seal checked, cycles by number, messages by topic.
 
     log = open_log("runs/x.mcap")
     log.params, log.session, log.attachments["cell.toml"]
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import bisect
 import functools
+import hashlib
 import itertools
 import json
 import mmap
@@ -28,6 +29,8 @@ from asc_rt.core.params import Params
 from asc_rt.record import RecordLayout
 from logs import mcap_scan, schema
 from logs.mcap_scan import CorruptLog, Extent, ForeignFile, LogError, Op, Raw
+from logs.seal import PREFIX as SEAL_PREFIX
+from logs.seal import Seals
 
 __all__ = ["CorruptLog", "ForeignFile", "Log", "LogError", "LogMessage", "open_log", "records"]
 
@@ -51,10 +54,11 @@ class Log:
     """A recording. Made by `open_log`."""
 
     def __init__(self, path: Path, data: mmap.mmap) -> None:
-        self.path, self._data, self._name = path, data, str(path)
+        self.path, self.data, self._name = path, data, str(path)
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.extent = Extent()
+        self.seals = Seals(self._name)
         self._topics: dict[int, str] = {}
         self._schemas: dict[int, Schema] = {}
         self._cycle_channel = -1
@@ -65,7 +69,7 @@ class Log:
         self.params = self._load_params()
         self.layout = RecordLayout(self.params.n)
         try:
-            self._wall_minus_monotonic_ns = int(self.session["wall_minus_monotonic_ns"])
+            self.wall_minus_monotonic_ns = int(self.session["wall_minus_monotonic_ns"])
         except (KeyError, ValueError) as error:
             raise CorruptLog(f"{self._name}: damaged: its session metadata tell no clock") from error
 
@@ -82,6 +86,11 @@ class Log:
     def end(self) -> dict[str, str]:
         """What the logger wrote when it closed the file; empty: it did not."""
         return self.metadata.get(schema.END, {})
+
+    @property
+    def recovered(self) -> dict[str, str]:
+        """What `asc recover` told when it closed the file; empty: the logger closed it, or nobody."""
+        return self.metadata.get(schema.RECOVERED, {})
 
     @property
     def fingerprint(self) -> dict[str, Any]:
@@ -101,6 +110,11 @@ class Log:
             if chunk.cycles:
                 yield np.frombuffer(b"".join(self._cycle_data(chunk)), self.layout.dtype)
 
+    @property
+    def chunks_with_cycles(self) -> int:
+        """As many as `batches` gives."""
+        return sum(chunk.cycles > 0 for chunk in self._chunks)
+
     def columns(self, *paths: str) -> dict[str, np.ndarray[Any, Any]]:
         """Some fields of all cycles: path -> one array. Their copy is all that stays in memory."""
         parts = [{path: batch[path].copy() for path in paths} for batch in self.batches()]
@@ -116,11 +130,11 @@ class Log:
             for raw in mcap_scan.chunk_records(content, self._name):
                 if raw.op == Op.MESSAGE and mcap_scan.message_channel(content, raw) in wanted:
                     found = mcap_scan.message(content, raw)
-                    t_ns = found.log_time_ns - self._wall_minus_monotonic_ns
+                    t_ns = found.log_time_ns - self.wall_minus_monotonic_ns
                     yield LogMessage(wanted[found.channel], t_ns, found.data)
 
     def _uncached_content(self, raw: Raw) -> bytes:
-        return mcap_scan.chunk_data(self._data, self._name, raw)
+        return mcap_scan.chunk_data(self.data, self._name, raw)
 
     def _cycle_data(self, chunk: _ChunkRef) -> list[bytes]:
         content, channel = self._content(chunk.raw), self._cycle_channel
@@ -136,8 +150,10 @@ class Log:
     # --- opening -----------------------------------------------------------------------------------------------------
 
     def _scan(self) -> None:
-        data, name = self._data, self._name
+        data, name, sha = self.data, self._name, hashlib.sha256(mcap_scan.MAGIC)
         for raw in mcap_scan.frames(data, name, self.extent):
+            sha_before = sha.hexdigest() if raw.op == Op.METADATA else ""
+            sha.update(data[raw.start : raw.end])
             if raw.op == Op.CHUNK:
                 self._scan_chunk(raw)
             elif raw.op == Op.ATTACHMENT:
@@ -145,9 +161,21 @@ class Log:
                 self.attachments[attachment.name] = attachment.data
             elif raw.op == Op.METADATA:
                 metadata = mcap_scan.parse(Metadata, data, name, raw)
-                self.metadata[metadata.name] = metadata.metadata
+                self._meet_metadata(metadata, raw.start, sha_before)
+        self.seals.finish(self.extent.closed, bool(self.recovered))
         if self._cycle_channel < 0 and (self.extent.closed or self._chunks):
             raise ForeignFile(f"{name}: an MCAP file, but no recording of a cell (no {schema.CYCLE.topic})")
+
+    def _meet_metadata(self, found: Metadata, at: int, sha256: str) -> None:
+        """`sha256`: of the bytes before it."""
+        if found.name.startswith(SEAL_PREFIX):
+            self.seals.check(found.metadata, at, sha256)
+        elif found.name in self.metadata:
+            raise CorruptLog(f"{self._name}: altered at byte {at}: its metadata {found.name!r} are there twice")
+        else:
+            self.metadata[found.name] = found.metadata
+            if found.name == schema.SESSION:
+                self.seals.begin(found.metadata)
 
     def _scan_chunk(self, chunk: Raw) -> None:
         content = self._content(chunk)

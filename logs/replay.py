@@ -6,8 +6,11 @@ does not depend on where one starts or in which order one goes, because a record
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterable
+import multiprocessing
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -17,9 +20,9 @@ from asc_rt.core.params import Params
 from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs
 from asc_rt.fingerprint import fingerprint
 from asc_rt.fixed_protobuf import RecordError
-from logs import schema
 from logs.diff import Difference, altered, differences
 from logs.reader import Log, open_log
+from logs.wire import replay_wire
 
 Stepper = Callable[[CoreState, CycleInputs], tuple[CoreState, CycleOutputs]]
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm
@@ -27,7 +30,7 @@ Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm
 TOLERANCE = (
     1e-6  # SI units. Another processor rounds the QP and the trigonometry differently (ASSUMED; 1e-9 is typical)
 )
-WIRE_TOLERANCE = 1e-6  # rad: float32 degrees of the wire are up to 2.7e-7 rad off
+PART = 500  # cycles that a worker takes at once
 
 
 class Order(StrEnum):
@@ -51,6 +54,8 @@ class ReplayReport:
     fingerprint_match: bool
     first_difference: FirstDifference | None  # the one of the lowest tick
     wire_mismatches: int  # cycles whose sample or command is not what passed on the wire
+    wire_first: str  # the first of them, in words
+    wire_decoded: bool  # by the driver's codec; False: only the presence of the packets was checked
     gaps: int  # places where records are missing
     tolerance: float  # 0: bytes were compared
     largest_difference: float  # of numbers, SI units
@@ -72,46 +77,110 @@ def core_stepper(params: Params) -> Stepper:
     return lambda state, inputs: step(system, state, inputs)
 
 
+@dataclass(slots=True)
+class _Found:
+    """What a part of the log gave."""
+
+    count: int = 0
+    mismatches: int = 0
+    largest: float = 0.0
+    exact: bool = True
+    first: FirstDifference | None = None
+
+    def add(self, other: _Found) -> None:
+        self.count += other.count
+        self.mismatches += other.mismatches
+        self.largest, self.exact = max(self.largest, other.largest), self.exact and other.exact
+        if other.first is not None and (self.first is None or other.first.cycle < self.first.cycle):
+            self.first = other.first
+
+
 def replay(
     path: str | Path,
     start: int = 0,
     order: Order = Order.FORWARD,
     *,
     stepper: Callable[[Params], Stepper] = core_stepper,
-    params: Params | None = None,
+    cycles: Sequence[int] | None = None,
+    jobs: int = 1,
     progress: Progress = iter,
 ) -> ReplayReport:
-    """Run the records from number `start` (0 = first) on again. `params`: a what-if instead of the logged ones.
+    """Run the records from number `start` (0 = first) on again, or just `cycles`. `jobs`: processes that share it.
 
     LogError: the file. IndexError: fewer records than `start`.
     """
     log = open_log(path)
     if not 0 <= start < max(log.cycles, 1):
         raise IndexError(f"cycle {start}: the log has {log.cycles}")
-    again = stepper(params or log.params)
+    numbers: Sequence[int] = range(start, log.cycles) if cycles is None else cycles
+    if order is Order.REVERSE:
+        numbers = numbers[::-1]
     match = log.fingerprint.get("hash") == fingerprint()["hash"]
     tolerance = 0.0 if match else TOLERANCE
-    numbers: Iterable[int] = range(start, log.cycles)
-    if order is Order.REVERSE:
-        numbers = reversed(range(start, log.cycles))
-    count, mismatches, largest, exact = 0, 0, 0.0, True
-    first: FirstDifference | None = None
-    for index in progress(numbers):
-        count += 1
+    found = _Found()
+    if jobs == 1:
+        found = _replay_part(log, stepper(log.params), progress(numbers), tolerance)
+    else:
+        _replay_shared(found, path, stepper, numbers, tolerance, jobs, progress)
+    gaps, wire = _gaps(log), replay_wire(log)
+    return ReplayReport(
+        found.count, found.mismatches, found.exact, match, found.first, wire.mismatches, wire.first, wire.decoded, gaps,
+        tolerance, found.largest, log.truncated,
+    )  # fmt: skip
+
+
+def _replay_part(log: Log, again: Stepper, numbers: Iterable[int], tolerance: float) -> _Found:
+    total = _Found()
+    for index in numbers:
+        total.count += 1
         found = compare(log, index, again)
         if not found:
             continue
-        exact = False
-        largest = max([largest, *(d.distance for d in found)])
+        total.exact = False
+        total.largest = max([total.largest, *(d.distance for d in found)])
         beyond = [d for d in found if d.distance > tolerance]
-        mismatches += bool(beyond)
+        total.mismatches += bool(beyond)
         tick = _tick(log, index)
-        if beyond and (first is None or tick < first.cycle):
-            first = FirstDifference(tick, beyond[0].field, beyond[0].logged, beyond[0].replayed)
-    gaps, wire = _gaps(log), wire_mismatches(log)
-    return ReplayReport(
-        count, mismatches, exact, match, first, wire, gaps, tolerance, largest, log.truncated
-    )  # fmt: skip
+        if beyond and (total.first is None or tick < total.first.cycle):
+            total.first = FirstDifference(tick, beyond[0].field, beyond[0].logged, beyond[0].replayed)
+    return total
+
+
+def _replay_shared(
+    found: _Found,
+    path: str | Path,
+    stepper: Callable[[Params], Stepper],
+    numbers: Sequence[int],
+    tolerance: float,
+    jobs: int,
+    progress: Progress,
+) -> None:
+    """The same on several cores: which cycle is run where makes no difference, because each record stands alone."""
+    parts = [numbers[i : i + PART] for i in range(0, len(numbers), PART)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, _begin_worker, (str(path), stepper)) as pool:
+        done = pool.map(_worker_part, parts, itertools.repeat(tolerance))
+        ends = progress(numbers)
+        counted = iter(ends)
+        for part in done:
+            found.add(part)
+            for _ in range(part.count):
+                next(counted, None)
+
+
+_worker: tuple[Log, Stepper] | None = None  # of this process
+
+
+def _begin_worker(path: str, stepper: Callable[[Params], Stepper]) -> None:
+    global _worker
+    log = open_log(path)
+    _worker = log, stepper(log.params)
+
+
+def _worker_part(numbers: Sequence[int], tolerance: float) -> _Found:
+    assert _worker is not None
+    log, again = _worker
+    return _replay_part(log, again, numbers, tolerance)
 
 
 def compare(log: Log, index: int, again: Stepper) -> list[Difference]:
@@ -153,28 +222,3 @@ def _tick(log: Log, index: int) -> int:
 def _gaps(log: Log) -> int:
     ticks = log.columns("inputs.tick")["inputs.tick"]
     return int((ticks[1:] != ticks[:-1] + 1).sum())
-
-
-def wire_mismatches(log: Log) -> int:
-    """Cycles whose joint sample or sent command has no packet of its moment in the log, or was sent as something else.
-
-    0 for a log without packets: there is nothing to compare with.
-    """
-    received, sent = (
-        {schema.parse_wire_message(m.data)[0] for m in log.messages(channel.topic)}
-        for channel in (schema.WIRE_RX, schema.WIRE_TX)
-    )
-    if not received and not sent:
-        return 0
-    return sum(not (_was_heard(row, received) and _was_sent(row, sent)) for batch in log.batches() for row in batch)
-
-
-def _was_heard(row: Any, received: set[int]) -> bool:
-    return not row["inputs.joint.present"] or int(row["inputs.joint.t_rx_ns"]) in received
-
-
-def _was_sent(row: Any, sent: set[int]) -> bool:
-    if not (row["receipt.present"] and row["receipt.ok"]):
-        return True  # nothing claims to have been sent
-    told = abs(row["receipt.q"] - row["outputs.command.q"]).max()
-    return int(row["receipt.t_tx_ns"]) in sent and bool(told <= WIRE_TOLERANCE)

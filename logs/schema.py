@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
 from asc_rt import human_state_pb2, record
 
@@ -13,7 +13,8 @@ PROFILE = "asc"  # of the MCAP header
 LIBRARY = "asc-rt logs.writer"
 
 PARAMS, CELL, FINGERPRINT = "params.json", "cell.toml", "fingerprint.json"  # names of attachments
-SESSION, END = "session", "end"  # names of metadata records
+PACKAGES, CLOCK, CERTIFICATE = "packages.txt", "clock.json", "certificate"
+SESSION, END, RECOVERED = "session", "end", "recovered"  # names of metadata records
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +28,9 @@ class Channel:
 
     @property
     def schema_encoding(self) -> str:
-        return "protobuf" if self.schema_data else ""
+        if not self.schema_data:
+            return ""
+        return "ros2msg" if self.encoding == "cdr" else "protobuf"
 
 
 def _file_set(*files: descriptor_pb2.FileDescriptorProto) -> bytes:
@@ -52,13 +55,14 @@ def _human_file() -> descriptor_pb2.FileDescriptorProto:
     return file
 
 
-def _message_class(file: descriptor_pb2.FileDescriptorProto, name: str) -> Any:
+def _message_class(name: str, *files: descriptor_pb2.FileDescriptorProto) -> Any:
     pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
+    for file in files:
+        pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-_Wire = _message_class(_wire_file(), "asc.v1.Wire")
+_Wire = _message_class("asc.v1.Wire", _wire_file())
 
 
 def wire_message(t_ns: int, length: int, data: bytes) -> bytes:
@@ -73,6 +77,83 @@ def parse_wire_message(message: bytes) -> tuple[int, int, bytes]:
     return wire.t_ns, wire.length, wire.data
 
 
+# --- messages of others, by their published definitions ---------------------------------------------------------------
+
+
+def _foxglove_file() -> descriptor_pb2.FileDescriptorProto:
+    """FrameTransforms and Log of Foxglove's schemas: the fields that we fill, under their numbers."""
+    field = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name="foxglove/asc.proto", package="foxglove", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    level = file.enum_type.add(name="LogLevel")
+    for number, name in enumerate(_LEVELS):
+        level.value.add(name=name, number=number)
+
+    def message(type_name: str, /, **fields: tuple[int, int, str]) -> None:
+        made = file.message_type.add(name=type_name)
+        for key, (number, kind, of) in fields.items():
+            label = field.LABEL_REPEATED if key == "transforms" else field.LABEL_OPTIONAL
+            made.field.add(name=key, number=number, label=label, type=kind, type_name=of or None)
+
+    stamp = field.TYPE_MESSAGE, ".google.protobuf.Timestamp"
+    real, text, inner = (field.TYPE_DOUBLE, ""), (field.TYPE_STRING, ""), field.TYPE_MESSAGE
+    message("Vector3", x=(1, *real), y=(2, *real), z=(3, *real))
+    message("Quaternion", x=(1, *real), y=(2, *real), z=(3, *real), w=(4, *real))
+    message(
+        "FrameTransform", timestamp=(1, *stamp), parent_frame_id=(2, *text), child_frame_id=(3, *text),
+        translation=(4, inner, ".foxglove.Vector3"), rotation=(5, inner, ".foxglove.Quaternion"),
+    )  # fmt: skip
+    message("FrameTransforms", transforms=(1, inner, ".foxglove.FrameTransform"))
+    level_type = (field.TYPE_ENUM, ".foxglove.LogLevel")
+    message("Log", timestamp=(1, *stamp), level=(2, *level_type), message=(3, *text), name=(4, *text))
+    return file
+
+
+_LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+
+
+def _timestamp_file() -> descriptor_pb2.FileDescriptorProto:
+    file = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(file)
+    return file
+
+
+_FOXGLOVE = _file_set(_timestamp_file(), _foxglove_file())
+FrameTransforms = _message_class("foxglove.FrameTransforms", _timestamp_file(), _foxglove_file())
+_Log = _message_class("foxglove.Log", _timestamp_file(), _foxglove_file())
+
+
+def log_message(wall_ns: int, level: str, text: str) -> bytes:
+    """A line for the viewers' log panels."""
+    message = _Log(level=level, message=text, name="cell")
+    message.timestamp.FromNanoseconds(wall_ns)
+    data: bytes = message.SerializeToString()
+    return data
+
+
+def parse_log_message(data: bytes) -> tuple[str, str]:
+    """(level, text) of `log_message`."""
+    message = _Log.FromString(data)
+    return _LEVELS[message.level], message.message
+
+
+_JOINT_STATE = b"""std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+# --- the channels ----------------------------------------------------------------------------------------------------
+
 _WIRE = _file_set(_wire_file())
 
 CYCLE = Channel("/cell/cycle", "protobuf", record.NAME, _file_set(*record.file_descriptor_set().file))
@@ -84,6 +165,11 @@ GOAL = Channel("/cell/goal")
 CONTROL = Channel("/cell/control")
 DROPOUT = Channel("/cell/dropout")  # {"cycle": n, "wire": n}: slots lost in the rings so far
 TRUTH = Channel("/sim/truth")
+TRANSFORMS = Channel("/tf", "protobuf", "foxglove.FrameTransforms", _FOXGLOVE)
+LOG = Channel("/log", "protobuf", "foxglove.Log", _FOXGLOVE)
+JOINT_STATES = Channel("/joint_states", "cdr", "sensor_msgs/msg/JointState", _JOINT_STATE)
+ROBOT_DESCRIPTION = Channel("/robot_description", "cdr", "std_msgs/msg/String", b"string data\n")
 HELLO = Channel("/session")  # one message before all others, so that the schemas are on disk from the first moment
 
-CHANNELS = (CYCLE, WIRE_RX, WIRE_TX, HUMAN, OPERATOR, GOAL, CONTROL, DROPOUT, TRUTH, HELLO)
+DRAWN = (ROBOT_DESCRIPTION, TRANSFORMS, JOINT_STATES, LOG)  # for viewers that know nothing of us
+CHANNELS = (CYCLE, WIRE_RX, WIRE_TX, HUMAN, OPERATOR, GOAL, CONTROL, DROPOUT, TRUTH, HELLO, *DRAWN)

@@ -17,6 +17,10 @@ APPROACH_M_S = 0.01  # ASSUMED: slower is the servo's trembling about its set-po
 
 Column = np.ndarray[Any, Any]
 
+STOP_COLUMNS = (  # what `stops` needs
+    "state.mode", "state.reason", "inputs.tick", "inputs.t_ns", "outputs.decision.reason", "outputs.command.present",
+    "outputs.command.is_last", "outputs.stop.present",
+)  # fmt: skip
 _AT_STOP = (Mode.STOPPING, Mode.STOPPED, Mode.FAULT)
 _COLUMNS = (
     "state.mode", "state.reason", "state.reached_id",
@@ -86,7 +90,7 @@ def stops(c: dict[str, Column]) -> list[dict[str, Any]]:
 
 def exit_reason(c: dict[str, Column]) -> str:
     """Name of the StopReason that ended the session; UNFINISHED: the log stops in mid-session."""
-    ended = len(c["state.mode"]) and Mode(int(_last_mode(c))).is_over
+    ended = len(c["state.mode"]) and _last_mode(c).is_over
     return StopReason(int(c["outputs.decision.reason"][-1])).name if ended else "UNFINISHED"
 
 
@@ -97,11 +101,11 @@ def dropped(log: Log, tick: Column) -> int:
     return max([missing, *counted])
 
 
-def _last_mode(c: dict[str, Column]) -> int:
-    """Mode after the last cycle."""
+def _last_mode(c: dict[str, Column]) -> Mode:
+    """After the last cycle."""
     over = c["outputs.stop.present"][-1] or (c["outputs.command.present"][-1] and c["outputs.command.is_last"][-1])
     if not over:
-        return int(c["state.mode"][-1])
+        return Mode(int(c["state.mode"][-1]))
     return Mode.FAULT if StopReason(int(c["outputs.decision.reason"][-1])).is_fault else Mode.ENDED
 
 

@@ -9,12 +9,9 @@ the ring and closes the file. Ctrl-C is left to the supervisor: the cycles of th
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
-import platform
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -22,17 +19,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from asc_rt import ring, topics
 from asc_rt.bus import Bus, BusError, Latest, Publisher, Queue, open_client
 from asc_rt.config import Cell, ConfigError, load_cell
 from asc_rt.core.types import Mode, StopReason
-from asc_rt.fingerprint import fingerprint
 from asc_rt.record import RecordLayout
 from logs import schema
-from logs.log_file import LogFile
+from logs.context import attachments, session
+from logs.display import Display
+from logs.seal import KeyFileError, load_key
+from logs.session_files import SessionFiles
 
-POLL_S = 0.02
+POLL_S = 0.05
 FLUSH_NS = 50_000_000  # what a crash of the machine may cost
 STATE_NS = 100_000_000
 MAX_TAKE = 1000  # messages of one key in one poll: a flood must not keep the cycles waiting
@@ -48,19 +48,24 @@ BUS_CHANNELS = (
 
 
 class Logger:
-    """Moves everything that is there into the file: `poll` again and again, then `finish`."""
+    """Moves everything that is there into the file: `poll` again and again, then `finish`.
+
+    When the disk takes no more, the file is closed as well as it can be, and from then on cycles are counted only.
+    """
 
     def __init__(
         self,
-        log: LogFile,
+        log: SessionFiles,
         layout: RecordLayout,
         cycles: ring.RingReader,
         wire: ring.RingReader | None,
         bus: Bus | None,
+        display: Display | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._log, self._layout, self._clock = log, layout, clock
-        self._cycles, self._wire = cycles, wire
+        self._cycles, self._wire, self._display = cycles, wire, display
+        self._t_offset = layout.dtype.fields["inputs.t_ns"][1]  # type: ignore[index]
         self._inboxes: list[tuple[Latest | Queue, schema.Channel]] = []
         self._state: Publisher | None = None
         if bus is not None:
@@ -70,6 +75,9 @@ class Logger:
         self._newest: bytes | None = None
         self._next_flush_ns = self._next_state_ns = self.last_cycle_ns = clock()
         self.records = 0
+        self._unsafe = 0  # cycles taken since the last flush
+        self.unrecorded = 0  # cycles taken that are not in the file
+        self.failure: OSError | None = None  # why nothing is written any more
 
     @property
     def finished(self) -> bool:
@@ -78,65 +86,109 @@ class Logger:
 
     def poll(self) -> None:
         """Take what is there; flush and tell the state when it is time."""
-        self._take_cycles()
-        self._take_wire()
-        self._take_bus()
-        self._count_losses()
         now_ns = self._clock()
-        if now_ns >= self._next_flush_ns:
-            self._flush()
-            self._next_flush_ns = now_ns + FLUSH_NS
+        try:
+            self._take(now_ns)
+        except OSError as error:
+            if self.failure is not None:
+                raise
+            self._give_up(error)
         if now_ns >= self._next_state_ns:
             self._tell_state()
             self._next_state_ns = now_ns + STATE_NS
 
     def finish(self, reason: str) -> None:
         """Take the rest and close the file."""
+        self._next_flush_ns = self._clock()
         self.poll()
         self._tell_state()
+        if self.failure is None:
+            try:
+                self._close(reason)
+                self._commit()
+            except OSError as error:
+                self._give_up(error)
+
+    def _take(self, now_ns: int) -> None:
+        self._take_cycles()
+        self._take_wire()
+        self._take_bus()
+        self._count_losses()
+        if now_ns >= self._next_flush_ns and self.failure is None:
+            self._log.flush()
+            self._commit()
+            self._next_flush_ns = now_ns + FLUSH_NS
+
+    def _close(self, reason: str) -> None:
         lost = {f"lost {name}": str(count) for name, count in self._lost.items()}
-        self._flush()
-        self._log.close({"reason": reason, "records": str(self.records), **lost})
+        self._log.close({"reason": reason, "records": str(self.records), "unrecorded": str(self.unrecorded), **lost})
+
+    def _give_up(self, error: OSError) -> None:
+        """What was taken and is not safe stays in the ring, uncommitted: `asc recover --ring` finds it there."""
+        self.failure = error
+        self.unrecorded += self._unsafe
+        self.records -= self._unsafe
+        self._log.log.forget()
+        try:
+            self._close(f"the disk failed: {error.strerror}")
+        except OSError:
+            self._log.log.abandon()
 
     def _take_cycles(self) -> None:
-        t_offset = self._layout.dtype.fields["inputs.t_ns"][1]  # type: ignore[index]
-        for record in self._cycles.drain():
-            t_ns = int.from_bytes(record[t_offset : t_offset + 8], "little", signed=True)
-            self._log.message(schema.CYCLE, t_ns, record)
-            self._newest = record
-            self.records += 1
+        for payload in self._cycles.drain():
             self.last_cycle_ns = self._clock()
+            if self.failure is not None:
+                self._newest = payload
+                self.unrecorded += 1
+                continue
+            buffer = bytearray(payload)
+            self._layout.seal(buffer)
+            self._newest = record = bytes(buffer)
+            self.records += 1
+            self._unsafe += 1
+            t_ns = int.from_bytes(record[self._t_offset : self._t_offset + 8], "little", signed=True)
+            self._log.message(schema.CYCLE, t_ns, record)
+            if self._display is not None:
+                self._display.cycle(self._log.log, t_ns, record)
 
     def _take_wire(self) -> None:
         if self._wire is None:
             return
         for payload in self._wire.drain():
-            direction, t_ns, length, data = ring.parse_wire(payload)
-            channel = schema.WIRE_RX if direction == "rx" else schema.WIRE_TX
-            self._log.message(channel, t_ns, schema.wire_message(t_ns, length, data))
+            if self.failure is None:
+                direction, t_ns, length, data = ring.parse_wire(payload)
+                channel = schema.WIRE_RX if direction == "rx" else schema.WIRE_TX
+                self._log.message(channel, t_ns, schema.wire_message(t_ns, length, data))
 
     def _take_bus(self) -> None:
         for inbox, channel in self._inboxes:
             for _ in range(MAX_TAKE):
                 if (data := inbox.take()) is None:
                     break
-                self._log.message(channel, self._clock(), data)
+                if self.failure is None:
+                    self._log.message(channel, self._clock(), data)
 
     def _count_losses(self) -> None:
         lost = {"cycle": self._cycles.lost, "wire": self._wire.lost if self._wire else 0}
-        if lost != self._lost:
+        if lost != self._lost and self.failure is None:
             self._lost = lost
             self._log.json(schema.DROPOUT, self._clock(), lost)
 
-    def _flush(self) -> None:
-        self._log.flush()
+    def _commit(self) -> None:
+        """Everything taken is safe in the file."""
+        self._unsafe = 0
         for reader in (self._cycles, self._wire):
             if reader is not None:
                 reader.commit()
 
+    @property
+    def dropped(self) -> int:
+        """Cycles that are not in the file."""
+        return self._cycles.lost + self.unrecorded
+
     def _tell_state(self) -> None:
         if self._state is not None and self._newest is not None:
-            self._state.put_json(state_message(self._layout, self._newest, self._lost["cycle"]))
+            self._state.put_json(state_message(self._layout, self._newest, self.dropped))
 
 
 def state_message(layout: RecordLayout, record: bytes, dropped: int) -> dict[str, Any]:
@@ -154,49 +206,10 @@ def state_message(layout: RecordLayout, record: bytes, dropped: int) -> dict[str
     }
 
 
-# --- what is known before the first cycle ----------------------------------------------------------------------------
-
-
-def attachments(cell: Cell) -> dict[str, bytes]:
-    """Everything that a reader needs to run the session again and to judge it."""
-    robot = cell.params.robot
-    return {
-        schema.PARAMS: cell.params.canonical(),
-        schema.CELL: cell.text.encode(),
-        f"{robot.name}.urdf": robot.urdf.encode(),
-        schema.FINGERPRINT: json.dumps(fingerprint(), indent=1).encode(),
-    }
-
-
-def session(cell: Cell) -> dict[str, str]:
-    """Who, where and what, as text."""
-    uname = platform.uname()
-    return {
-        "cell": cell.name,
-        "overrides": " ".join(cell.overrides),
-        "simulated": str(cell.simulated).lower(),
-        "params_sha256": cell.params.content_hash(),
-        "git_commit": git_commit(),
-        "host": f"{uname.node} {uname.system} {uname.release} {uname.machine}",
-        "python": platform.python_version(),
-        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
-
-
-def git_commit(root: Path = Path(__file__).parent) -> str:
-    """The commit of this code, with `-dirty` when files differ from it; `unknown` outside a checkout."""
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return done.stdout.strip()
-
-
 # --- the process -----------------------------------------------------------------------------------------------------
 
 
-def record_session(logger: Logger, stopping: Callable[[], bool]) -> str:
+def record_session(logger: Logger, stopping: Callable[[], bool], stop_when_full: bool) -> str:
     """Poll until the session is over; why it is."""
     supervisor = os.getppid()
     while True:
@@ -205,21 +218,44 @@ def record_session(logger: Logger, stopping: Callable[[], bool]) -> str:
             return "session closed"
         if stopping():
             return "terminated"
+        if logger.failure is not None and stop_when_full:
+            return "the disk failed"
         if os.getppid() != supervisor and time.monotonic_ns() - logger.last_cycle_ns > ORPHAN_NS:
             return "supervisor died"
         time.sleep(POLL_S)
 
 
-def run(cell: Cell, ring_path: str, out: str, stopping: Callable[[], bool]) -> None:
+def run(cell: Cell, ring_path: str, out: str, stopping: Callable[[], bool]) -> int:
+    """Exit code: 0, or 1 if cycles are missing because of the disk."""
     layout = RecordLayout(cell.params.n)
     with ring.RingReader(ring_path) as cycles, ring.RingReader(ring.wire_path(ring_path)) as wire:
         if cycles.slot_size != layout.size:
             raise ring.RingError(f"{ring_path}: made for another record", hint="both ends must run the same code")
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        path = Path(out)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        display = Display(cell.params, layout)
         with open_client(cell.bus_endpoint) as bus:
-            log = LogFile(out, attachments(cell), session(cell))
-            logger = Logger(log, layout, cycles, wire, bus)
-            logger.finish(record_session(logger, stopping))
+            files = SessionFiles(
+                path, attachments(cell), session(cell), _key(cell), cell.log.rotate_ns, begin=display.begin
+            )
+            logger = Logger(files, layout, cycles, wire, bus, display)
+            logger.finish(record_session(logger, stopping, cell.log.stop_when_full))
+    if logger.failure is None:
+        return 0
+    reason = logger.failure.strerror or str(logger.failure)
+    return _refuse(f"{out}: {reason}: {logger.unrecorded} cycles are not in the log", code=1)
+
+
+def _key(cell: Cell) -> Ed25519PrivateKey | None:
+    """KeyFileError: the cell names a key that cannot be used. Without a place for a key of one's own there are no
+    seals, and the audit says so."""
+    try:
+        return load_key(cell.log.key)
+    except KeyFileError as error:
+        if cell.log.key is not None:
+            raise
+        print(f"logger: not sealed: {error}; {error.hint}", file=sys.stderr)
+        return None
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -233,20 +269,19 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda number, _: terminated.append(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        run(load_cell(options.cell, options.set), options.ring, options.out, lambda: bool(terminated))
+        return run(load_cell(options.cell, options.set), options.ring, options.out, lambda: bool(terminated))
     except ConfigError as error:
         return _refuse(*error.lines)
-    except (ring.RingError, BusError) as error:
+    except (ring.RingError, BusError, KeyFileError) as error:
         return _refuse(f"{error}; {error.hint}" if error.hint else str(error))
     except OSError as error:
         return _refuse(f"{options.out}: cannot record: {error.strerror or error}")
-    return 0
 
 
-def _refuse(*lines: str) -> int:
+def _refuse(*lines: str, code: int = 2) -> int:
     for line in lines:
         print(f"logger: {line}", file=sys.stderr)
-    return 2
+    return code
 
 
 if __name__ == "__main__":

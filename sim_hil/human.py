@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from asc_rt import human_state_pb2 as pb
-from asc_rt import topics
+from asc_rt import realtime, topics
 from asc_rt.bus import Bus, BusError, open_client
 from asc_rt.config import ConfigError, load_cell
 from sim_hil.person import Capsules, Person
 
+PRIORITY = 30  # SCHED_FIFO, below the robot's and the controller's
 TRUTH_PERIOD_NS = 8_000_000
 READY_PERIOD_NS = 500_000_000
 SENSOR_ID = 1
@@ -177,6 +178,7 @@ def main(cell_path: str, argv: list[str]) -> int:
         signal.signal(number, lambda signum, _: stop.append(signum))
     try:
         with open_client(cell.bus_endpoint) as bus:
+            realtime.set_up(PRIORITY, None)  # a late person would stop the robot for nothing
             print(f"ready human: seed {options.seed}, {options.rate_hz:g} Hz", flush=True)
             publish(bus, options, stop)
     except BusError as error:

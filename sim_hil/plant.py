@@ -3,8 +3,9 @@
 An oracle that shares no code with the controller: MuJoCo reads the URDF itself; dynamics, distances and contacts are
 MuJoCo's. The joints are torque motors at 1 kHz under a stiff servo, as on the real arm: inverse dynamics, a velocity
 loop, and a position loop that asks for no more than the data sheet's speed; torque is cut at the URDF's efforts.
-The arm meets the person only: not itself and not the floor. The person's capsules are moved by hand (mocap), so a
-contact pushes the arm, never them; it is as soft as MuJoCo's default (20 ms).
+A torque-controlled arm has no servo: the torque that is set acts for one period.
+The arm meets the person only: not itself and not the floor. Contacts are found and told but push nobody: the person is
+a script that gives way to nothing, and no arm's servo answers a person of infinite force as a real contact would.
 Units: SI, radians; robot base frame.
 """
 
@@ -25,8 +26,10 @@ Array = npt.NDArray[np.float64]
 
 SUBSTEP = 0.001  # s
 SERVO_BANDWIDTH = 120.0  # rad/s, ASSUMED: far above what a robot controller's set-points contain
-ROTOR_INERTIA = 1e-3  # kg m2 at the joint per Nm of effort, ASSUMED: not published, the size of a geared servo motor's
+ROTOR_INERTIA = 1e-3  # kg m2 at the joint per Nm of effort, ASSUMED: not published, the size of a geared servo motor's.
+# Position-controlled arms only: the identified inertias of a torque-controlled one include what its motors add.
 PARKED = np.array([0.0, 0.0, -1000.0])  # m, where unused capsules of the person wait
+NO_FORCE = 1e3  # m: contacts are found at 0 (margin + gap) and push only when this deep (margin)
 FAR = 1e3  # m, beyond this MuJoCo need not look
 SHORTEST = 1e-4  # m, half length of a person's capsule that is a sphere
 
@@ -93,6 +96,7 @@ class MujocoPlant:
         """At rest at q, nobody there."""
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = q
+        self._torque: Array | None = None
         self._reached = self._target = self.q  # where the servo was and will be, at the end of a period
         self._data.mocap_pos[:] = PARKED
         self._labels: tuple[str, ...] = ()
@@ -106,19 +110,19 @@ class MujocoPlant:
             raise ValueError(f"target {target.tolist()}: {len(self._target)} finite angles are needed")
         self._target = target
 
+    def set_torque(self, tau: npt.ArrayLike) -> None:
+        """Torque of the coming periods, instead of the servo. ValueError: not finite numbers, one per joint."""
+        torque = np.array(tau, dtype=np.float64)
+        if torque.shape != self._target.shape or not np.isfinite(torque).all():
+            raise ValueError(f"torque {torque.tolist()}: {len(self._target)} finite torques are needed")
+        self._torque = torque
+
     def step(self) -> None:
         """One control period: the servo follows a straight line from the last target to the new one."""
         model, data = self._model, self._data
-        start, way = self._reached, self._target - self._reached
-        speed = way / self._period
-        torque = np.empty(model.nv)
         self._contacts = {}
         for i in range(self._substeps):
-            error = start + way * ((i + 1) / self._substeps) - data.qpos
-            catch_up = np.clip(SERVO_BANDWIDTH / 2 * error, -self._fastest, self._fastest)
-            wish = 2 * SERVO_BANDWIDTH * (speed + catch_up - data.qvel)
-            mujoco.mj_mulM(model, data, torque, wish)
-            data.ctrl[:] = torque + data.qfrc_bias
+            data.ctrl[:] = self._servo((i + 1) / self._substeps) if self._torque is None else self._torque
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)  # positions, velocities and contacts of the new state
             if data.ncon:
@@ -126,6 +130,16 @@ class MujocoPlant:
         if not np.isfinite(data.qpos).all():
             raise FloatingPointError("the simulated arm has diverged")
         self._reached = self._target
+
+    def _servo(self, share: float) -> Array:
+        """Torque of the servo, `share` of the period on: inverse dynamics plus the two loops."""
+        way, data = self._target - self._reached, self._data
+        catch_up = np.clip(
+            SERVO_BANDWIDTH / 2 * (self._reached + way * share - data.qpos), -self._fastest, self._fastest
+        )
+        torque: Array = np.empty(self._model.nv)
+        mujoco.mj_mulM(self._model, data, torque, 2 * SERVO_BANDWIDTH * (way / self._period + catch_up - data.qvel))
+        return torque + data.qfrc_bias
 
     def set_person(self, person: Capsules) -> None:
         """Put the person there. ValueError: more capsules than the plant has."""
@@ -204,11 +218,12 @@ def _build(params: Params) -> Any:
         geom = body.add_geom(name=f"person/{i}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.05, SHORTEST, 0])
         geom.contype = geom.conaffinity = 0
         for name in robot:  # explicit pairs pass by the bounding tree, which would not know of changed capsule sizes
-            spec.add_pair(geomname1=name, geomname2=geom.name, condim=1)
+            spec.add_pair(geomname1=name, geomname2=geom.name, condim=1, margin=-NO_FORCE, gap=NO_FORCE)
     for joint in spec.joints:
         motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
-        joint.armature = ROTOR_INERTIA * joint.actfrcrange[1]  # the URDF's effort
+        if params.control != "torque":
+            joint.armature = ROTOR_INERTIA * joint.actfrcrange[1]  # the URDF's effort
     return spec.compile()
 
 

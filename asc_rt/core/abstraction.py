@@ -14,8 +14,8 @@ envelope theorem gives F'' = |w_dot|^2 + w . w_ddot - b^T A^-1 b, with A the Hes
 derivative, both over those of (s, t) that are inside their segment. Leaving the term out over-estimates d_ddot by
 20-30 m/s2 at the 99th percentile, on the unsafe side (facts: safe control 4.1, real-time Python 6).
 
-The realizable set of d_ddot under joint bounds lower <= u <= upper is an interval, and the one-sided radius
-    M = drift - a_h_max + sum_i max(C_i lower_i, C_i upper_i)
+The realizable set of d_ddot under u in U is an interval, and the one-sided radius
+    M = drift - a_h_max + max over U of C u
 is what an index that only ever asks for *more* separation needs (errata 1, 3, 4 of the paper: the zero-centred ball
 shrinks for nothing when the drift helps, and is negative in up to 9 % of the states of an acceleration-limited arm).
 """
@@ -28,8 +28,9 @@ import numpy as np
 from numba import njit
 
 from asc_rt.core.kinematics import Chain, Motion, cross, forward
-from asc_rt.core.limits import Bounds, acceleration_box
-from asc_rt.core.robot_model import Capsules
+from asc_rt.core.polytope import greatest
+from asc_rt.core.realizable import control_set
+from asc_rt.core.robot_model import Arm, Capsules
 from asc_rt.core.types import Vector
 
 # ASSUMED: below this the direction of separation is numerical noise; the pair counts as touching.
@@ -254,27 +255,15 @@ def separation(
 
 
 @njit(cache=True)
-def radius(C: Vector, drift: float, lower: Vector, upper: Vector) -> float:
-    """One-sided radius M of the realizable set {C u + drift : lower <= u <= upper}: its upper end, m/s2."""
-    value = drift
-    for i in range(C.shape[0]):
-        value += max(C[i] * lower[i], C[i] * upper[i])
-    return value
-
-
-@njit(cache=True)
 def _radii_at(
-    chain: Chain,
-    capsules: Capsules,
+    arm: Arm,
     people: People,
     q: Vector,
     dq: Vector,
-    bounds: Bounds,
-    human_acceleration: float,
-    robot: Vector,
-    human: Vector,
-    shift: float,
     ddq: Vector,
+    human_acceleration: float,
+    pairs: Separation,
+    shift: float,
 ) -> Vector:
     """M of the given pairs at the state `shift` seconds along (dq, ddq) and the people's velocities."""
     q_s, dq_s = q + shift * dq, dq + shift * ddq
@@ -286,40 +275,23 @@ def _radii_at(
         people.radius,
         people.velocity_bound,
     )
-    motion = forward(chain, q_s, dq_s)
-    lower, upper = acceleration_box(bounds, q_s, dq_s)
-    out = np.empty(robot.shape[0])
+    motion = forward(arm.chain, q_s, dq_s)
+    U = control_set(arm, motion, q_s, dq_s)
+    out = np.empty(pairs.d.shape[0])
     C, r0, r1 = np.empty(q.shape[0]), np.empty(3), np.empty(3)
-    for i in range(robot.shape[0]):
-        joint = capsules.joint[robot[i]]
-        _place(motion, joint, capsules.p0[robot[i]], r0)
-        _place(motion, joint, capsules.p1[robot[i]], r1)
-        drift = _pair(
-            motion,
-            joint,
-            r0,
-            r1,
-            capsules.radius[robot[i]],
-            moved,
-            human[i],
-            human_acceleration,
-            C,
-        )[2]
-        out[i] = radius(C, drift, lower, upper)
+    for i in range(out.shape[0]):
+        c = pairs.robot[i]
+        joint = arm.capsules.joint[c]
+        _place(motion, joint, arm.capsules.p0[c], r0)
+        _place(motion, joint, arm.capsules.p1[c], r1)
+        drift = _pair(motion, joint, r0, r1, arm.capsules.radius[c], moved, pairs.human[i], human_acceleration, C)[2]
+        out[i] = drift + greatest(C, U)
     return out
 
 
 @njit(cache=True)
 def radii(
-    chain: Chain,
-    capsules: Capsules,
-    people: People,
-    q: Vector,
-    dq: Vector,
-    ddq: Vector,
-    bounds: Bounds,
-    human_acceleration: float,
-    pairs: Separation,
+    arm: Arm, people: People, q: Vector, dq: Vector, ddq: Vector, human_acceleration: float, pairs: Separation
 ) -> tuple[Vector, Vector]:
     """M and M_dot = dM/dx . x_dot of every pair, x = (q, dq, people), x_dot = (dq, ddq, people's velocities).
 
@@ -327,20 +299,9 @@ def radii(
     difference is numeric and two-sided; of its left and right halves the smaller one counts: M falling is what harms.
     """
     h = DIFFERENCE_STEP
-    args = (
-        chain,
-        capsules,
-        people,
-        q,
-        dq,
-        bounds,
-        human_acceleration,
-        pairs.robot,
-        pairs.human,
-    )
-    here = _radii_at(*args, 0.0, ddq)
-    ahead = _radii_at(*args, h, ddq)
-    behind = _radii_at(*args, -h, ddq)
+    here = _radii_at(arm, people, q, dq, ddq, human_acceleration, pairs, 0.0)
+    ahead = _radii_at(arm, people, q, dq, ddq, human_acceleration, pairs, h)
+    behind = _radii_at(arm, people, q, dq, ddq, human_acceleration, pairs, -h)
     slope = np.empty(here.shape[0])
     for i in range(here.shape[0]):
         right, left = (ahead[i] - here[i]) / h, (here[i] - behind[i]) / h

@@ -22,7 +22,7 @@ def brake(system: System, state: CoreState) -> SetPoint:
     """The set-point one period on along the stop. Raises smoothing.SmoothingError."""
     if at_rest(state):
         zero = vector(np.zeros(system.n))
-        return SetPoint(state.q_cmd, zero, zero)
+        return SetPoint(state.q_cmd, zero, zero, zero)
     zeros = [0.0] * system.n
     return profile(system, state, zeros, zeros)
 

@@ -33,6 +33,16 @@ def may_pass(system: System, state: CoreState, point: SetPoint) -> bool:
     )
 
 
+def torque_may_pass(system: System, point: SetPoint) -> bool:
+    """Finite, and inside the torque and acceleration limits. Positions and speeds are measured here, not commanded."""
+    values = np.concatenate((point.ddq, point.tau))
+    return bool(
+        np.all(np.isfinite(values))
+        and np.all(np.abs(point.tau) <= (1.0 + ROUNDING) * system.model.arm.effort)
+        and np.all(np.abs(point.ddq) <= (1.0 + ROUNDING) * system.bounds.ddq_max)
+    )
+
+
 def keeps_rows(point: SetPoint, C: Matrix, floor: Vector) -> bool:
     """The acceleration that is really sent satisfies every safety row."""
     return bool(np.all(C @ point.ddq >= floor - SOLVER_MARGIN))

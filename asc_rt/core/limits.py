@@ -74,8 +74,8 @@ def _fits(
 def reserve(dq_max: float, A: float, J: float, T: float) -> float:
     """Part of the way to a position limit that is kept free, rad.
 
-    The planned stop changes its jerk at any moment, set-points only at multiples of T: reaching full braking later by that
-    costs up to J T^2 / 8 of speed (no more than A T), and this much speed lasts until the stop is over..
+    The planned stop changes its jerk at any moment, set-points only at multiples of T. Full braking that comes later by
+    that costs up to J T^2 / 8 of speed (no more than A T), and this much speed lasts until the stop is over.
     """
     return min(J * T * T / 8.0, A * T) * (dq_max / A + A / J)
 

@@ -81,7 +81,9 @@ def _hear(
         state = dataclasses.replace(state, event_id=event.id)
         if event.kind is EventKind.ARM and state.mode in (Mode.HOLD, Mode.STOPPED) and not state.ending:
             refused = finding
-            if finding is StopReason.NONE and not d_measured >= params.safety.rearm_distance:
+            if finding is StopReason.NONE and x.joint is None:
+                refused = StopReason.LATE  # without a sample there is no distance to judge by
+            elif finding is StopReason.NONE and not d_measured >= params.safety.rearm_distance:
                 refused = StopReason.START_INSIDE
             armed = refused is StopReason.NONE
             state = dataclasses.replace(state, mode=Mode.ACTIVE if armed else state.mode, reason=refused)

@@ -34,6 +34,7 @@ class RobotParams:
     dq_max: tuple[float, ...]  # rad/s
     ddq_max: tuple[float, ...]  # rad/s2
     dddq_max: tuple[float, ...]  # rad/s3
+    effort: tuple[float, ...]  # Nm, torque limits of a torque-controlled arm; () if it takes positions
     command_latency_ns: int  # from sending a set-point to the arm being there
     capsules: tuple[CapsuleSpec, ...]
 
@@ -74,6 +75,7 @@ class TaskParams:
 @dataclass(frozen=True, slots=True)
 class Params:
     period_ns: int
+    control: str  # "acceleration": the robot takes positions; "torque"
     silence_cycles: int  # this many periods without a sample are a silent robot
     tracking_tolerance: float  # rad, measured against commanded, beyond what the latency explains
     robot: RobotParams
@@ -107,7 +109,7 @@ def _build(kind: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
         if unknown := set(value) - set(hints):
-            raise KeyError(f"{kind.__name__} has no {', '.join(sorted(unknown))}")
+            raise KeyError(f"not of this version: {', '.join(sorted(unknown))}")
         return typing.cast(Any, kind)(
             **{f.name: _build(hints[f.name], value[f.name]) for f in dataclasses.fields(kind)}
         )

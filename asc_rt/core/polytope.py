@@ -11,9 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
-from asc_rt.core.types import Vector
+from asc_rt.core.types import IntVector, Matrix, Vector
+
+BoolVector = npt.NDArray[np.bool_]
 
 TOLERANCE = 1e-9  # relative to the bounds: a row violated by less is kept
 MAX_PIVOTS = 200  # far above the 2n or so that occur; a cycling program ends as "empty", which stops the robot
@@ -27,77 +30,108 @@ class Polytope(NamedTuple):
     high: np.ndarray  # (m,)
 
 
+class Support(NamedTuple):
+    """The best vertex of U in a direction c, and why it is the best: c = y_box + G^T y_rows.
+
+    A multiplier is positive at an upper bound, negative at a lower one, zero where the constraint is not active. By the
+    envelope theorem the value moves with the data as d(c) . u + sum_i y_i d(bound_i) - y_rows . dG u.
+    """
+
+    value: float  # -inf if U is empty
+    u: np.ndarray  # (n,)
+    y: np.ndarray  # (n + m,) of the box, then of the rows
+
+
 @njit(cache=True)
 def greatest(c: Vector, U: Polytope) -> float:
-    """max c . u over U, by the dual simplex method; -inf if U is empty.
+    """max c . u over U; -inf if U is empty."""
+    return support(c, U).value
+
+
+@njit(cache=True)
+def _worst_row(u: Vector, U: Polytope) -> tuple[int, bool]:
+    """The most violated constraint (< n box, >= n row of G), and whether at its upper bound; -1: none."""
+    n = u.shape[0]
+    worst, entering, to_upper = TOLERANCE, -1, True
+    for r in range(n + U.G.shape[0]):
+        if r < n:
+            reached, below, above = u[r], U.lower[r], U.upper[r]
+        else:
+            reached, below, above = 0.0, U.low[r - n], U.high[r - n]
+            for k in range(n):
+                reached += U.G[r - n, k] * u[k]
+        scale = 1.0 / (1.0 + abs(below) + abs(above))
+        if (reached - above) * scale > worst:
+            worst, entering, to_upper = (reached - above) * scale, r, True
+        if (below - reached) * scale > worst:
+            worst, entering, to_upper = (below - reached) * scale, r, False
+    return entering, to_upper
+
+
+@njit(cache=True)
+def _exchange(w: Vector, side: float, leaving: int, inverse: Matrix) -> None:
+    """The inverse after the leaving constraint's normal was replaced by one that is side * w in the old basis."""
+    n = w.shape[0]
+    for k in range(n):
+        inverse[k, leaving] /= side * w[leaving]
+    for j in range(n):
+        if j != leaving:
+            for k in range(n):
+                inverse[k, j] -= side * w[j] * inverse[k, leaving]
+
+
+@njit(cache=True)
+def _vertex(active: IntVector, at_upper: BoolVector, inverse: Matrix, U: Polytope, u: Vector) -> None:
+    """The point where the active constraints meet."""
+    n = u.shape[0]
+    u[:] = 0.0
+    for j in range(n):
+        r = active[j]
+        below, above = (U.lower[r], U.upper[r]) if r < n else (U.low[r - n], U.high[r - n])
+        bound = above if at_upper[j] else below
+        for k in range(n):
+            u[k] += inverse[k, j] * bound
+
+
+@njit(cache=True)
+def support(c: Vector, U: Polytope) -> Support:
+    """max c . u over U with its vertex and multipliers, by the dual simplex method.
 
     Starts at the vertex of the box that c points to, which is dual feasible, and brings the worst violated row into
     the basis until none is violated. With no rows G it is the closed form sum_i max(c_i lower_i, c_i upper_i).
     """
-    n, m = c.shape[0], U.G.shape[0]
-    value = 0.0
+    n = c.shape[0]
+    multipliers = np.zeros(n + U.G.shape[0])
     u, y = np.empty(n), c.copy()  # vertex; multipliers of the n active constraints
-    active = np.arange(n)  # index of the active constraint: < n box, >= n row of G
-    at_upper = np.empty(n, np.bool_)
+    active = np.arange(n)  # the active constraints: < n box, >= n row of G
+    at_upper = c > 0.0
     inverse = np.eye(n)  # of the matrix whose rows are the active constraints' normals
-    for i in range(n):
-        at_upper[i] = c[i] > 0.0
-        u[i] = U.upper[i] if at_upper[i] else U.lower[i]
-        value += c[i] * u[i]
-    if m == 0:
-        return value
-    w, normal = np.empty(n), np.empty(n)
+    w = np.empty(n)
+    _vertex(active, at_upper, inverse, U, u)
     for _ in range(MAX_PIVOTS):
-        worst, entering, to_upper = TOLERANCE, -1, True
-        for r in range(n + m):
-            if r < n:
-                reached, below, above = u[r], U.lower[r], U.upper[r]
-            else:
-                reached, below, above = 0.0, U.low[r - n], U.high[r - n]
-                for k in range(n):
-                    reached += U.G[r - n, k] * u[k]
-            scale = 1.0 / (1.0 + abs(below) + abs(above))
-            if (reached - above) * scale > worst:
-                worst, entering, to_upper = (reached - above) * scale, r, True
-            if (below - reached) * scale > worst:
-                worst, entering, to_upper = (below - reached) * scale, r, False
+        entering, to_upper = _worst_row(u, U)
         if entering < 0:
             value = 0.0
             for k in range(n):
                 value += c[k] * u[k]
-            return value
+                multipliers[active[k]] = y[k]
+            return Support(value, u, multipliers)
         side = 1.0 if to_upper else -1.0
-        for k in range(n):
-            normal[k] = (1.0 if k == entering else 0.0) if entering < n else U.G[entering - n, k]
         leaving, least = -1, np.inf
         for j in range(n):
             w[j] = 0.0
             for k in range(n):
-                w[j] += side * normal[k] * inverse[k, j]
+                normal = (1.0 if k == entering else 0.0) if entering < n else U.G[entering - n, k]
+                w[j] += side * normal * inverse[k, j]
             blocks = w[j] > 1e-12 if at_upper[j] else w[j] < -1e-12
             if blocks and y[j] / w[j] < least:
                 leaving, least = j, y[j] / w[j]
         if leaving < 0:
-            return -np.inf
+            break
         for j in range(n):
             y[j] -= least * w[j]
         y[leaving] = side * least
         active[leaving], at_upper[leaving] = entering, to_upper
-        pivot = side * w[leaving]
-        for k in range(n):
-            inverse[k, leaving] /= pivot
-        for j in range(n):
-            if j != leaving:
-                for k in range(n):
-                    inverse[k, j] -= side * w[j] * inverse[k, leaving]
-        for k in range(n):
-            u[k] = 0.0
-        for j in range(n):
-            r = active[j]
-            if r < n:
-                bound = U.upper[r] if at_upper[j] else U.lower[r]
-            else:
-                bound = U.high[r - n] if at_upper[j] else U.low[r - n]
-            for k in range(n):
-                u[k] += inverse[k, j] * bound
-    return -np.inf
+        _exchange(w, side, leaving, inverse)
+        _vertex(active, at_upper, inverse, U, u)
+    return Support(-np.inf, u, multipliers)

@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from asc_rt.core.dynamics import Inertias
 from asc_rt.core.kinematics import Chain
+from asc_rt.core.limits import Bounds
 from asc_rt.core.params import CapsuleSpec, RobotParams, ToolParams
 
 
@@ -25,14 +27,31 @@ class Capsules(NamedTuple):
     radius: np.ndarray  # (m,) m
 
 
-class RobotModel(NamedTuple):
-    pin_model: pin.Model  # the controlled joints only; tests compare against it
+class Arm(NamedTuple):
+    """What the kernels know of the arm with its tool."""
+
     chain: Chain
     capsules: Capsules
+    bodies: Inertias
+    bounds: Bounds
+    effort: np.ndarray  # (n,) Nm, torque limits; (0,): the arm takes positions and its torque is its own affair
+
+
+class RobotModel(NamedTuple):
+    pin_model: pin.Model  # the controlled joints only; tests compare against it
+    arm: Arm
     capsule_names: tuple[str, ...]
 
+    @property
+    def chain(self) -> Chain:
+        return self.arm.chain
 
-def load(robot: RobotParams, tool: ToolParams) -> RobotModel:
+    @property
+    def capsules(self) -> Capsules:
+        return self.arm.capsules
+
+
+def load(robot: RobotParams, tool: ToolParams, control: str = "acceleration") -> RobotModel:
     """Model of the arm with its tool, all joints but `robot.joints` locked at zero.
 
     Raises ModelError: unparsable URDF, unknown joint or link, joints that are not revolute or not in series,
@@ -59,11 +78,13 @@ def load(robot: RobotParams, tool: ToolParams) -> RobotModel:
         inertia = model.inertias[i]
         if inertia.mass <= 0.0 or np.linalg.eigvalsh(inertia.inertia).min() <= 0.0:
             raise ModelError(f"robot {robot.name}: the link moved by {model.names[i]} has no mass or inertia")
+    effort = np.array(robot.effort if control == "torque" else ())
+    if control == "torque" and len(effort) != model.nv:
+        raise ModelError(f"robot {robot.name}: torque control needs a torque limit (effort) for every joint")
     specs = (*robot.capsules, *tool.capsules)
     return RobotModel(
         pin_model=model,
-        chain=_chain(model),
-        capsules=_capsules(model, specs),
+        arm=Arm(_chain(model), _capsules(model, specs), _bodies(model), _bounds(robot), effort),
         capsule_names=tuple(
             [f"{c.link}.{i}" for i, c in enumerate(robot.capsules)]
             + [f"{tool.name}.{i}" for i in range(len(tool.capsules))]
@@ -96,6 +117,19 @@ def _chain(model: pin.Model) -> Chain:
         offset=np.ascontiguousarray([p.translation for p in placements]),
         axis=np.ascontiguousarray(axes),
     )
+
+
+def _bodies(model: pin.Model) -> Inertias:
+    bodies = [model.inertias[i] for i in range(1, model.njoints)]
+    return Inertias(
+        mass=np.array([b.mass for b in bodies]),
+        com=np.array([b.lever for b in bodies]),
+        inertia=np.ascontiguousarray([b.inertia for b in bodies]),
+    )
+
+
+def _bounds(robot: RobotParams) -> Bounds:
+    return Bounds(*(np.array(v) for v in (robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, robot.dddq_max)))
 
 
 def _capsules(model: pin.Model, specs: tuple[CapsuleSpec, ...]) -> Capsules:

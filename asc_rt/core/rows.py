@@ -14,6 +14,7 @@ from asc_rt.core.safe_control import Solution
 from asc_rt.core.safety_index import phi_rate, row_floors
 from asc_rt.core.smoothing import SetPoint
 from asc_rt.core.system import System
+from asc_rt.core.torque import command_set
 from asc_rt.core.types import (
     MAX_PAIRS,
     CoreState,
@@ -57,18 +58,18 @@ def rows(system: System, state: CoreState, x: CycleInputs) -> Rows:
     found = separation(*model, q, dq, s.activation_distance, s.human_acceleration)
     order = np.argsort(found.d, kind="stable")
     found = Separation(*(values[order] for values in found))
-    M, M_dot = radii(*model, q, dq, ddq, system.bounds, s.human_acceleration, found)
+    M, M_dot = radii(system.model.arm, people, q, dq, ddq, s.human_acceleration, found)
     T, b = system.params.period, system.bounds
     brake_time = float(np.max(np.abs(dq) / b.ddq_max + b.ddq_max / b.dddq_max))
-    lower, upper = command_box(b, q, dq, ddq, T)
+    U = command_set(system, q, dq, *command_box(b, q, dq, ddq, T))
     value, floor, base, basis = row_floors(
         found,
         M,
         M_dot,
         ddq,
         b.dddq_max,
-        lower,
-        upper,
+        U.lower,
+        U.upper,
         T,
         s.d_min,
         s.k,
@@ -84,7 +85,7 @@ def rows(system: System, state: CoreState, x: CycleInputs) -> Rows:
         floor,
         base,
         basis,
-        Polytope(lower, upper, np.zeros((0, system.n)), np.zeros(0), np.zeros(0)),
+        U,
     )
 
 

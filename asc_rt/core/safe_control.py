@@ -60,6 +60,15 @@ def solve(u_ref: Vector, C: Matrix, floor: Vector, base: Vector, U: Polytope, sc
     return Solution(u_ref, found.u, kept, True, iterations, share)
 
 
+def project(u: Vector, U: Polytope, scale: Vector) -> Vector | None:
+    """The control of U nearest to u; None if U is empty."""
+    if _inside(u, U):
+        return u
+    none = np.zeros((0, len(u)))
+    found = _quadratic(u, none, np.zeros(0), np.zeros(0), U, scale, shared=False)
+    return found.u if found.solved and _inside(found.u, U) else None
+
+
 def _inside(u: Vector, U: Polytope) -> bool:
     torque = U.G @ u
     return bool(
@@ -96,8 +105,8 @@ def _quadratic(
         None,
         None,
         np.asfortranarray(np.vstack((rows, torque))),
-        np.concatenate((base + SOLVER_MARGIN, U.low)),
-        np.concatenate((np.full(len(base), np.inf), U.high)),
+        np.concatenate((base + SOLVER_MARGIN, U.low + SOLVER_MARGIN)),
+        np.concatenate((np.full(len(base), np.inf), U.high - SOLVER_MARGIN)),
         np.concatenate(((U.lower + inset) / scale, np.zeros(extra))),
         np.concatenate(((U.upper - inset) / scale, np.ones(extra))),
     )

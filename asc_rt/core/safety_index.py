@@ -7,22 +7,25 @@
 <= 0 takes a separation acceleration of 2 d v M / k - v M_dot / M, which is at most M if k >= 2 d v + |d_min^2 - d^2|
 (-M_dot) / M.
 
-A position-streaming arm is a third-order system: it cannot brake at once, it first has to ramp its acceleration down at
-its jerk limit. phi is therefore asked for at the *end of that ramp*, not now:
+A position-streaming arm is a third-order system: it cannot brake at once, it first has to ramp its acceleration down
+at its jerk limit. phi is therefore asked for over *the whole stop*, not now:
 
-    psi(z) = phi at the end of the ramp that starts in z = (d, v, a), a = -d_ddot, and falls with jerk J until the
-    braking
-             that phi* = 0 asks for there is reached (or the approach is over)
+    psi(z) = largest phi on the hardest brake from z = (d, v, a), a = -d_ddot: a falls with jerk J to -B and stays there
+             until the approach is over
 
-and the row keeps psi <= 0 after the coming period. psi rises with the acceleration that is commanded, so the row is one
-number per pair, found by bisection: the least separation acceleration. If psi(z) <= 0 now, the ramp itself is a control
-that keeps the row next time: that is what makes it persistently feasible while M and J last. psi > 0 (a person comes
-faster than the robot alone can make good) has to fall by the share eta T each period.
+and the row keeps psi <= 0 after the coming period. psi rises with v, with a and with -d, since a brake that starts
+nearer or faster stays nearer and faster throughout; so the row is one number per pair, found by bisection: the least
+separation acceleration. The brake is itself a control that keeps psi where it is: that is what makes the row
+persistently feasible while M and J last, for every k > 0. (phi at the end of the ramp only, with the braking that
+phi* = 0 asks for *now*, is not enough: the speed still grows on the ramp; an abstract system with M = J / (1/s) came to
+0.08 d_min.) psi > 0 (a person comes faster than the robot alone can make good) has to fall by the share eta T each
+period, and not by M rising: that is no doing of the robot's.
 
 No row asks for more than the smallest of three (`Basis` says which):
     INDEX       what psi asks for
     STANDSTILL  that the robot's own approach, ramps included, ends: a robot that does not approach is safe however fast
-                the person comes (ISO 10218-2, speed and separation monitoring); retreating is never slowed
+                the person comes (ISO 10218-2, speed and separation monitoring); retreating is never slowed. Inside
+                d_min the index asks for no less than this.
     RAMP        the ramp itself: the share JERK_SHARE of what the joint bounds of this period leave, up to BRAKE_SHARE M
 """
 
@@ -34,7 +37,6 @@ import numpy as np
 from numba import njit
 
 from asc_rt.core.abstraction import Separation
-from asc_rt.core.limits import BISECTIONS
 from asc_rt.core.types import Basis, IntVector, Vector
 
 # ASSUMED: share of a pair's jerk (sum of |C_i| dddq_max_i) that the index counts on. The rest serves the other rows
@@ -58,6 +60,9 @@ NO_JERK = 1e-6
 # m/s2: a floor that every control keeps; finite, so that arithmetic with floors is.
 NO_ROW = -1e6
 
+SHARPNESS = 28  # bisections of a row: 1e-6 m/s2 of 200, and the safe end is taken
+SEARCHES, POLISHES = 5, 2  # steps to the largest phi of a brake; smooth there: within 1e-5 of it
+
 INDEX, STANDSTILL, RAMP, M_FLOOR = (int(b) for b in (Basis.INDEX, Basis.STANDSTILL, Basis.RAMP, Basis.M_FLOOR))
 
 
@@ -72,6 +77,16 @@ def phi(d: float, v: float, M: float, d_min: float, k: float) -> float:
 
 
 @njit(cache=True)
+def _braking(t: float, d: float, v: float, a: float, B: float, J: float) -> tuple[float, float, float]:
+    """(d, v, a) after t seconds of the hardest brake: a falls with jerk J to -B and stays there."""
+    ramp = min(t, (a + B) / J)
+    v_ramp = v + a * ramp - J * ramp * ramp / 2.0
+    rest = t - ramp
+    way = v * ramp + a * ramp * ramp / 2.0 - J * ramp * ramp * ramp / 6.0 + v_ramp * rest - B * rest * rest / 2.0
+    return d - way, v_ramp - B * rest, a - J * ramp
+
+
+@njit(cache=True)
 def psi(
     d: float,
     v: float,
@@ -83,18 +98,38 @@ def psi(
     k: float,
     M_floor: float,
 ) -> float:
-    """phi at the end of the ramp from (d, v, a); see above."""
-    brake = min(BRAKE_SHARE * M, 2.0 * max(d, 0.0) * max(v, 0.0) * M / k)
-    t = max(0.0, (a + brake) / J)
-    # the approach may be over before: first zero of v + a t - J t^2 / 2
-    if v <= 0.0 and a <= 0.0:
-        t = 0.0
-    elif v + a * t - J * t * t / 2.0 < 0.0:
-        t = (a + math.sqrt(max(0.0, a * a + 2.0 * J * v))) / J
-    d_end = d - (v * t + a * t * t / 2.0 - J * t * t * t / 6.0)
-    v_end = v + a * t - J * t * t / 2.0
-    M_end = max(M_floor, M + min(0.0, M_dot) * t)
-    return phi(d_end, v_end, M_end, d_min, k)
+    """Largest phi on the hardest brake from (d, v, a); see above. M is taken as it will be at the end of the ramp."""
+    now = phi(d, v, max(M_floor, M), d_min, k)
+    square = a * a + 2.0 * J * v
+    if v < 0.0:  # retreating: the approach begins, if ever, where v = 0
+        if a <= 0.0 or square <= 0.0:
+            return now
+        d = _braking((a - math.sqrt(square)) / J, d, v, a, 0.0, J)[0]
+        v, a = 0.0, math.sqrt(square)
+    M = max(M_floor, M + min(0.0, M_dot) * max(0.0, a + BRAKE_SHARE * M) / J)
+    B = max(BRAKE_SHARE * M, -a)
+    ramp = (a + B) / J
+    v_ramp = _braking(ramp, d, v, a, B, J)[1]
+    end = ramp + v_ramp / B if v_ramp > 0.0 else (a + math.sqrt(a * a + 2.0 * J * v)) / J
+    # phi* rises as long as 2 d v + k a / M > 0, which ends once, on the ramp or after it: bisection, then Newton. On a
+    # brake that ends behind the surface (d < 0) phi0 takes over.
+    corner = min(ramp, end)
+    d_t, v_t, a_t = _braking(corner, d, v, a, B, J)
+    after = 2.0 * max(d_t, 0.0) * v_t + k * a_t / M > 0.0
+    early, late = (corner, end) if after else (0.0, corner)
+    t = 0.5 * (early + late)
+    for i in range(SEARCHES + POLISHES):
+        d_t, v_t, a_t = _braking(t, d, v, a, B, J)
+        slope = 2.0 * max(d_t, 0.0) * v_t + k * a_t / M
+        curve = (2.0 * (d_t * a_t - v_t * v_t) if d_t > 0.0 else 0.0) - (0.0 if after else k * J / M)
+        if slope > 0.0:
+            early = t
+        else:
+            late = t
+        newton = i >= SEARCHES and curve < 0.0
+        t = min(late, max(early, t - slope / curve)) if newton else 0.5 * (early + late)
+    d_t, v_t, _ = _braking(t, d, v, a, B, J)
+    return max(now, phi_star(max(d_t, 0.0), v_t, M, d_min, k), d_min - _braking(end, d, v, a, B, J)[0])
 
 
 @njit(cache=True)
@@ -116,7 +151,7 @@ def _psi_after(
         d - T * v - T * T * (2.0 * a + u) / 6.0,
         v + T * (a + u) / 2.0,
         u,
-        M + T * M_dot,
+        M + T * min(0.0, M_dot),
         M_dot,
         J,
         d_min,
@@ -138,15 +173,16 @@ def greatest_approach(
     k: float,
     eta: float,
     M_floor: float,
+    most: float,
 ) -> float:
-    """Greatest approach acceleration after the coming period that keeps the row, m/s2."""
+    """Greatest approach acceleration after the coming period that keeps the row, m/s2; `most`: all there can be."""
     target = max(0.0, psi(d, v, a, M, M_dot, J, d_min, k, M_floor) * (1.0 - eta * T))
-    low, high = -4.0 * M - abs(a) - 10.0, M + abs(a) + 100.0
+    low, high = -4.0 * M - abs(a) - 10.0, most
     if _psi_after(high, d, v, a, T, M, M_dot, J, d_min, k, M_floor) <= target:
         return high
     if _psi_after(low, d, v, a, T, M, M_dot, J, d_min, k, M_floor) > target:
         return low
-    for _ in range(BISECTIONS):
+    for _ in range(SHARPNESS):
         middle = 0.5 * (low + high)
         if _psi_after(middle, d, v, a, T, M, M_dot, J, d_min, k, M_floor) <= target:
             low = middle
@@ -195,10 +231,11 @@ def row_floors(
     p = M.shape[0]
     value, floor, base, basis = np.empty(p), np.empty(p), np.empty(p), np.empty(p, np.int64)
     for i in range(p):
-        along = J = most = 0.0
+        along = J = most = least = 0.0
         for j in range(ddq.shape[0]):
             along += pairs.C[i, j] * ddq[j]
             most += max(pairs.C[i, j] * lower[j], pairs.C[i, j] * upper[j])
+            least += min(pairs.C[i, j] * lower[j], pairs.C[i, j] * upper[j])
             J += JERK_SHARE * abs(pairs.C[i, j]) * dddq_max[j]
         within = (along + JERK_SHARE * (most - along) if most > along else most) - SLACKEN
         d, v, v_robot = pairs.d[i], -pairs.d_dot[i], -pairs.d_dot_robot[i]
@@ -212,7 +249,12 @@ def row_floors(
             base[i] = min(floor[i], along - SLACKEN)
             continue
         a = -(along + pairs.drift[i])
-        index = -greatest_approach(d, v, a, T, M[i], M_dot[i], J, d_min, k, eta, M_floor) - pairs.drift[i]
+        most_approach = -(least + pairs.drift[i])
+        index = (
+            -greatest_approach(d, v, a, T, M[i], M_dot[i], J, d_min, k, eta, M_floor, most_approach) - pairs.drift[i]
+        )
+        if d < d_min:  # not even towards a person who gives way
+            index = max(index, standstill)
         ramp = min(within, BRAKE_SHARE * M[i] - pairs.drift[i])
         floor[i], basis[i] = index, INDEX
         if standstill < floor[i]:

@@ -19,9 +19,10 @@ ROUNDING = 1.0 + 1e-6
 
 @dataclass(frozen=True, slots=True)
 class SetPoint:
-    q: Vector  # rad
+    q: Vector  # rad, one period on
     dq: Vector
     ddq: Vector
+    tau: Vector  # Nm; zero for an arm that takes positions
 
 
 class SmoothingError(Exception):
@@ -65,4 +66,4 @@ def profile(
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise SmoothingError(str(result))
     q, v, a = plan.at_time(system.params.period)
-    return SetPoint(vector(q), vector(v), vector(a))
+    return SetPoint(vector(q), vector(v), vector(a), vector([0.0] * system.n))

@@ -7,7 +7,6 @@ import numpy as np
 import ruckig
 
 from asc_rt.core import robot_model
-from asc_rt.core.limits import Bounds
 from asc_rt.core.params import Params
 from asc_rt.core.types import CoreState, Goal, Mode, StopReason, vector
 
@@ -19,8 +18,8 @@ class System:
         r = params.robot
         self.params = params
         self.n = params.n
-        self.model = robot_model.load(r, params.tool)
-        self.bounds = Bounds(*(np.array(v) for v in (r.q_min, r.q_max, r.dq_max, r.ddq_max, r.dddq_max)))
+        self.model = robot_model.load(r, params.tool, params.control)
+        self.bounds = self.model.arm.bounds
         self.planner = ruckig.Ruckig(self.n)
 
 

@@ -154,10 +154,10 @@ class StopReason(IntEnum):
     LATE = 9
     TRACKING = 10  # the robot does not follow its set-points
     GATE = 11
-    ROBOT_NOT_READY = 12
-    ROBOT_SILENT = 13
-    ROBOT_FAULTED = 14
-    EXCEPTION = 15
+    EXCEPTION = 12  # a defect of the controller itself
+    ROBOT_NOT_READY = 13
+    ROBOT_SILENT = 14
+    ROBOT_FAULTED = 15
 
     @property
     def is_fault(self) -> bool:

@@ -50,8 +50,10 @@ class UdpTransport:
             self._peer = (socket.gethostbyname(self._host), self._port)
             local = _local_address(self._peer)
         except OSError as error:
-            raise LinkError(f"no way to {self._host}: {error.strerror or error}",
-                            hint="check the robot's address in the cell file and this PC's network") from error
+            raise LinkError(
+                f"no way to {self._host}: {error.strerror or error}",
+                hint="check the robot's address in the cell file and this PC's network",
+            ) from error
         lock = OwnerLock("j519-{}-{}".format(*self._peer), self._lock_dir)
         lock.acquire()
         self._lock = lock
@@ -67,8 +69,10 @@ class UdpTransport:
         try:
             self._open_socket().sendto(data, self._peer)
         except OSError as error:
-            raise LinkError(f"cannot send to {self._host}:{self._port}: {error.strerror or error}",
-                            hint="check the cable and this PC's address on the robot's network") from error
+            raise LinkError(
+                f"cannot send to {self._host}:{self._port}: {error.strerror or error}",
+                hint="check the cable and this PC's address on the robot's network",
+            ) from error
         return time.monotonic_ns()
 
     def receive(self, deadline_ns: int) -> tuple[int, bytes] | None:
@@ -80,8 +84,10 @@ class UdpTransport:
             except (BlockingIOError, TimeoutError):
                 return None
             except OSError as error:
-                raise LinkError(f"cannot receive from {self._host}:{self._port}: {error.strerror or error}",
-                                hint="check the cable and this PC's network") from error
+                raise LinkError(
+                    f"cannot receive from {self._host}:{self._port}: {error.strerror or error}",
+                    hint="check the cable and this PC's network",
+                ) from error
             if peer == self._peer:
                 return time.monotonic_ns(), data
             self.foreign += 1

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 from sim_hil.fanuc.cabinet import Cabinet, Peer
 
 STRANGER: Peer = ("127.0.0.2", 50001)
-NAN = bytes.fromhex("7fc00000")
+NAN = bytes.fromhex("7ff8000000000000")  # as float64 and as float32
+NAN_AT = 56  # where every packet of numbers has one
 
 LINE = ("lose", "repeat", "delay", "reorder", "truncate", "nan", "foreign")  # + "_status" or "_command"
 ROBOT = (
@@ -96,7 +97,7 @@ class Line:
             case "truncate":
                 return [(peer, data[: len(data) // 2])]
             case "nan":
-                return [(peer, data[:60] + NAN + data[64:] if len(data) > 64 else data[:-4] + NAN)]
+                return [(peer, data[:NAN_AT] + NAN + data[NAN_AT + len(NAN) :])]
             case _:
                 return [packet, (peer, b"a packet of something else")]
 

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable
 
 from sim_hil.fanuc.cabinet import Device
+from sim_hil.fanuc.rmi import RmiServer
 
 PC = ("127.0.0.1", 50000)
 
@@ -64,3 +65,31 @@ class Lockstep:
             packets, self._outbox = [(PC, data) for data in self._outbox], []
             for _, reply in self.controller.cycle(packets):
                 self._inbox.extend((self._now_ns, data) for data in self.to_pc(reply))
+
+
+class RmiLine:
+    """Stands where a driver has its RMI connection; each exchange takes a cycle."""
+
+    def __init__(self, wire: Lockstep, server: RmiServer) -> None:
+        self._wire, self._server = wire, server
+        self._replies: deque[bytes] = deque()
+
+    def open(self, port: int) -> None:
+        """Whatever the port, it is this server."""
+        self._replies.clear()
+
+    def now_ns(self) -> int:
+        return self._wire.now_ns()
+
+    def send(self, line: bytes) -> None:
+        if self._wire.powered:
+            self._replies.extend(self._server.handle(line))
+
+    def receive(self, deadline_ns: int) -> bytes | None:
+        while not self._replies and self._wire.now_ns() < deadline_ns:
+            self._wire.run(1)
+        self._wire.run(1)
+        return self._replies.popleft() if self._replies else None
+
+    def close(self) -> None:
+        """Nothing to close."""

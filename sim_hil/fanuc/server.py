@@ -13,15 +13,19 @@ import socket
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import numpy as np
 
 from asc_rt.bus import BusError
 from asc_rt.config import Cell, ConfigError, load_cell
-from sim_hil.fanuc.arm import KinematicPlant
-from sim_hil.fanuc.cabinet import Peer
+from sim_hil.fanuc import wire, wire_b
+from sim_hil.fanuc.arm import KinematicPlant, Plant
+from sim_hil.fanuc.cabinet import Cabinet, Peer
 from sim_hil.fanuc.controller import Controller
+from sim_hil.fanuc.controller_b import ControllerB
+from sim_hil.fanuc.faults import Fault, FaultyController
+from sim_hil.fanuc.rmi_sockets import RmiSockets
 from sim_hil.fanuc.settings import Settings
 from sim_hil.world import World
 
@@ -30,43 +34,59 @@ MAX_DATAGRAM = 2048
 MAX_PACKETS = 64  # of one cycle: a flood must not stop the controller's time
 
 Publish = Callable[[int], None]
+Poll = Callable[[], None]
+
+
+CLASSIC, ROS = "fanuc-j519", "fanuc-stream-motion-b"  # drivers whose robot is simulated here
+VERSIONS = {CLASSIC: wire.USABLE_VERSIONS, ROS: wire_b.USABLE_VERSIONS}
+RMI_PORT = 16001
 
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim_hil fanuc", description=__doc__.splitlines()[0])
     parser.add_argument("cell", help="cell file or name of a cell")
-    parser.add_argument("--strict", action="store_true", help="exit code 1 if the PC broke the protocol")
-    parser.add_argument("--plant", choices=("mujoco", "kinematic"), default="mujoco",
-                        help="kinematic: no dynamics, no person, no bus")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="put over the cell file")
+    parser.add_argument("--strict", action="store_true", help="exit code 1 if the PC broke the protocol")
+    parser.add_argument(
+        "--plant", choices=("mujoco", "kinematic"), default="mujoco", help="kinematic: no dynamics, no person, no bus"
+    )
     args = parser.parse_args(argv)
     stop: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda signum, _: stop.append(signum))
-    try:
-        cell = load_cell(args.cell, args.set)
-        settings = Settings.parse({"period_ms": cell.params.period_ns * 1e-6, **cell.sim.get("fanuc", {})})
-        link = _bind(cell)
-    except (ConfigError, ValueError) as error:
-        return _fail(error, 2)
-    with link:
-        q0 = np.radians(settings.start_deg)
-        if args.plant == "kinematic":
-            return _run(link, Controller(KinematicPlant(q0, settings.period), settings), None, stop, args.strict)
+    with ExitStack() as stack:
         try:
-            world = World(cell, q0)
+            cell = load_cell(args.cell, args.set)
+            settings, script = _settings(cell)
+            link = stack.enter_context(_bind(cell))
+            plant, publish = _plant(cell, settings, args.plant, stack)
+            controller: Cabinet
+            if cell.driver["name"] == ROS:
+                controller = ControllerB(plant, settings)
+                sockets = _rmi(cell, controller)
+                stack.callback(sockets.close)
+                poll = sockets.poll
+            else:
+                controller, poll = Controller(plant, settings), None
+        except (ConfigError, ValueError) as error:
+            return _fail(error, 2)
         except BusError as error:
             return _fail(f"{error}; {error.hint}", 1)
-        try:
-            return _run(link, Controller(world, settings), world.publish, stop, args.strict)
-        finally:
-            world.close()
+        return _run(link, controller, script, (poll, publish), stop, args.strict)
+
+
+def _settings(cell: Cell) -> tuple[Settings, list[Fault]]:
+    """ValueError: this cell's robot is not ours to simulate, or something is wrong in [sim.fanuc]."""
+    name = cell.driver.get("name")
+    if name not in VERSIONS:
+        raise ValueError(f"the cell's driver is {name!r}, not one of {', '.join(map(repr, VERSIONS))}")
+    table = {"period_ms": cell.params.period_ns * 1e-6, **cell.sim.get("fanuc", {})}
+    script = [Fault.parse(entry) for entry in table.pop("faults", [])]
+    return Settings.parse(table, VERSIONS[name]), script
 
 
 def _bind(cell: Cell) -> socket.socket:
-    """ValueError: this cell's robot is not ours to simulate here."""
-    if cell.driver.get("name") != "fanuc-j519":
-        raise ValueError(f"the cell's driver is {cell.driver.get('name')!r}, not 'fanuc-j519'")
+    """ValueError: somebody else listens there."""
     host, port = cell.driver["host"], cell.driver.get("port", 60015)
     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     link.setblocking(False)
@@ -78,18 +98,49 @@ def _bind(cell: Cell) -> socket.socket:
     return link
 
 
-def _run(link: socket.socket, controller: Controller, publish: Publish | None, stop: list[int], strict: bool) -> int:
+def _rmi(cell: Cell, controller: ControllerB) -> RmiSockets:
+    host, port = cell.driver["host"], cell.driver.get("rmi_port", RMI_PORT)
+    try:
+        return RmiSockets(controller, host, port)
+    except OSError as error:
+        raise ValueError(f"cannot listen on {host}:{port} and {port + 1}: {error.strerror}") from None
+
+
+def _plant(cell: Cell, settings: Settings, kind: str, stack: ExitStack) -> tuple[Plant, Publish | None]:
+    q0 = np.radians(settings.start_deg)
+    if kind == "kinematic":
+        return KinematicPlant(q0, settings.period), None
+    world = World(cell, q0)
+    stack.callback(world.close)
+    return world, world.publish
+
+
+def _run(
+    link: socket.socket,
+    controller: Cabinet,
+    script: list[Fault],
+    others: tuple[Poll | None, Publish | None],
+    stop: list[int],
+    strict: bool,
+) -> int:
     _make_real_time()
     print("ready fanuc {}:{}".format(*link.getsockname()), flush=True)
-    cycles, skipped = serve(link, controller, publish, stop)
-    alarms = ", ".join(f"{alarm.number} {alarm.text}" for alarm in controller.alarms) or "none"
+    cycles, skipped = serve(link, controller, script, others, stop)
+    alarms = ", ".join(str(alarm) for alarm in controller.alarms) or "none"
     offences = len(controller.offences)
     print(f"fanuc: {cycles} cycles, {skipped} skipped, {offences} offences, alarms: {alarms}", flush=True)
     return 1 if strict and controller.offences else 0
 
 
-def serve(link: socket.socket, controller: Controller, publish: Publish | None, stop: list[int]) -> tuple[int, int]:
+def serve(
+    link: socket.socket,
+    controller: Cabinet,
+    script: list[Fault],
+    others: tuple[Poll | None, Publish | None],
+    stop: list[int],
+) -> tuple[int, int]:
     """Run until `stop` is not empty; (cycles run, periods skipped). Missed periods are lost time, never a burst."""
+    device, (poll, publish) = FaultyController(controller, script), others
     period_ns = round(controller.settings.period_ms * 1e6)
     cycles = skipped = told = 0
     due_ns = time.monotonic_ns() + period_ns
@@ -99,9 +150,11 @@ def serve(link: socket.socket, controller: Controller, publish: Publish | None, 
         if missed > 0:
             skipped += missed
             due_ns += missed * period_ns
-        for peer, data in controller.cycle(_drain(link)):
+        for peer, data in device.cycle(_drain(link)):
             with suppress(OSError):  # to a PC that went away or does not read it is lost, as on a cable
                 link.sendto(data, peer)
+        if poll is not None:
+            poll()
         if publish is not None:
             publish(time.monotonic_ns())
         for offence in controller.offences[told:]:

@@ -38,8 +38,8 @@ class Settings:
     start_deg: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, -90.0, 0.0)  # where the arm is at power-on, URDF joints
 
     @classmethod
-    def parse(cls, table: dict[str, Any]) -> Settings:
-        """ValueError naming every wrong entry."""
+    def parse(cls, table: dict[str, Any], versions: tuple[int, ...] = USABLE_VERSIONS) -> Settings:
+        """ValueError naming every wrong entry. `versions`: of the protocol that the wire knows."""
         known: dict[str, type] = {field.name: type(field.default) for field in fields(cls)}
         wrong = [f"unknown option {key!r} (known: {', '.join(known)})" for key in table if key not in known]
         if "start_deg" in table and not _is_pose(table["start_deg"]):
@@ -53,8 +53,8 @@ class Settings:
         for key, choices in (("arm", tuple(ARMS)), ("limit_alarms", tuple(LIMITS)), ("thinning", range(1, 16))):
             if key in table and table[key] not in choices:
                 wrong.append(f"{key} must be one of {tuple(choices)}, not {table[key]!r}")
-        if table.get("version", 3) not in USABLE_VERSIONS:
-            wrong.append(f"version must be one of {USABLE_VERSIONS}, not {table['version']!r}")
+        if table.get("version", 3) not in versions:
+            wrong.append(f"version must be one of {versions}, not {table['version']!r}")
         if wrong:
             raise ValueError("sim.fanuc: " + "; ".join(wrong))
         if "start_deg" in table:

@@ -38,8 +38,13 @@ class Tables:
         return np.asarray(below + (place - low) * (above - below))
 
 
-def _invented(max_speed: int, velocity: tuple[float, ...], acceleration: tuple[float, ...], jerk: tuple[float, ...],
-              without_payload: float) -> Tables:
+def _invented(
+    max_speed: int,
+    velocity: tuple[float, ...],
+    acceleration: tuple[float, ...],
+    jerk: tuple[float, ...],
+    without_payload: float,
+) -> Tables:
     """From the limits at full payload and speed. Their fall over the stages by a fifth is ASSUMED, as is the rest."""
     last = np.array([velocity, acceleration, jerk])[:, :, None]
     fall = np.stack([np.ones(STAGES), *[np.linspace(1.25, 1.0, STAGES)] * 2])[:, None, :]

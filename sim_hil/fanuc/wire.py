@@ -94,7 +94,7 @@ class Packet:
 
 def read_request(data: bytes) -> Packet:
     """A packet from the PC. Raises Malformed."""
-    packet = _read(data, REQUESTS)
+    packet = unpack(data, REQUESTS)
     if packet.type == 5 and packet.version < 2:
         raise Malformed("double precision command in version 1")
     if packet.name == "command":
@@ -109,10 +109,11 @@ def read_request(data: bytes) -> Packet:
 
 def read_reply(data: bytes) -> Packet:
     """A packet from a controller. Raises Malformed."""
-    return _read(data, REPLIES)
+    return unpack(data, REPLIES)
 
 
-def _read(data: bytes, table: Table) -> Packet:
+def unpack(data: bytes, table: Table) -> Packet:
+    """One packet of `table`. Raises Malformed."""
     if len(data) < 8:
         raise Malformed(f"{len(data)} bytes")
     number, version = (int(x) for x in np.frombuffer(data, ">u4", 2))
@@ -122,7 +123,7 @@ def _read(data: bytes, table: Table) -> Packet:
     # How long a version reply is was never documented: its header alone counts.
     if len(data) != layout.itemsize and not (name == "version" and table is REPLIES):
         raise Malformed(f"{name} of {len(data)} bytes instead of {layout.itemsize}")
-    if version == 0:
+    if version == 0 and "version" in (layout.names or ()):
         raise Malformed(f"{name} of version 0")
     fields = np.frombuffer(data, layout, 1)[0]
     for field in layout.names or ():
@@ -135,18 +136,20 @@ def _read(data: bytes, table: Table) -> Packet:
 
 
 def write_reply(name: str, version: int, **values: object) -> bytes:
-    return _write(REPLIES, name, version, values)
+    return pack(REPLIES, name, version, values)
 
 
 def write_request(name: str, version: int, **values: object) -> bytes:
     """What a PC sends, for the tests of the controller. A command is double precision from version 2 on."""
     table = REQUESTS if version > 1 else {k: v for k, v in REQUESTS.items() if k != 5}
-    return _write(table, name, version, values)
+    return pack(table, name, version, values)
 
 
-def _write(table: Table, name: str, version: int, values: dict[str, object]) -> bytes:
+def pack(table: Table, name: str, version: int, values: dict[str, object]) -> bytes:
+    """The packet `name` of `table`; fields that are not given are 0."""
     number = max(k for k, (known, _) in table.items() if known == name)
     fields = np.zeros(1, table[number][1])
-    for field, value in {"type": number, "version": version, **values}.items():
+    head = {"type": number, "version": version} if "version" in (table[number][1].names or ()) else {"type": number}
+    for field, value in {**head, **values}.items():
         fields[field] = value
     return fields.tobytes()

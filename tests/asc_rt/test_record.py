@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from asc_rt import record
 from asc_rt.core.types import MAX_CAPSULES, CycleInputs, EventKind, OperatorEvent, RobotFlag
 from asc_rt.fixed_protobuf import Array, Message, RecordError
-from asc_rt.record import MAX_EVENTS, CycleRecorder, Events, RecordLayout
+from asc_rt.record import MAX_EVENTS, Events, RecordLayout
 from drivers.base import WriteReceipt
 
 N = 6
@@ -58,12 +58,13 @@ def objects(message: Message) -> st.SearchStrategy[Any]:
 
 cycles = st.tuples(*map(objects, record.TABLE.values()))
 
-bounded = settings(max_examples=60, deadline=None)
+bounded = settings(max_examples=30, deadline=None)
 
 
 def packed(cycle: tuple[Any, ...]) -> bytearray:
     buffer = LAYOUT.buffer()
     LAYOUT.pack(buffer, *cycle)
+    LAYOUT.seal(buffer)
     return buffer
 
 
@@ -94,6 +95,7 @@ def test_unpack_is_the_exact_inverse_of_pack(cycle: tuple[Any, ...]) -> None:
 def test_nothing_of_the_cycle_before_stays_in_the_buffer(first: tuple[Any, ...], second: tuple[Any, ...]) -> None:
     buffer = packed(first)
     LAYOUT.pack(buffer, *second)
+    LAYOUT.seal(buffer)
     assert buffer == packed(second)
 
 
@@ -244,20 +246,3 @@ def test_every_changed_byte_is_noticed(offset: int, error: int) -> None:
     assert LAYOUT.syndrome(data) == 0
     data[offset] ^= error
     assert LAYOUT.syndrome(data) != 0
-
-
-class FakeRing:
-    def __init__(self) -> None:
-        self.payloads: list[bytes] = []
-
-    def put(self, payload: bytearray) -> None:
-        self.payloads.append(bytes(payload))
-
-
-def test_a_recorder_counts_what_it_cannot_pack_and_goes_on() -> None:
-    ring = FakeRing()
-    recorder = CycleRecorder(LAYOUT, ring)  # type: ignore[arg-type]
-    recorder.put(*example(receipt=dataclasses.replace(RECEIPT, q=np.zeros(N - 1))))
-    recorder.put(*example())
-    assert recorder.dropped == 1
-    assert ring.payloads == [bytes(packed(example()))]

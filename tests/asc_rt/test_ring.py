@@ -57,7 +57,31 @@ def test_every_slot_is_taken_or_counted(tmp_path_factory: pytest.TempPathFactory
         assert taken == sorted(taken, key=lambda data: int.from_bytes(data[:4], "little"))
 
 
-def test_a_slot_overwritten_while_it_is_read_is_lost_not_torn(path: Path) -> None:
+class Racing:
+    """The reader's memory; the producer laps the reader once, just while a slot is copied."""
+
+    def __init__(self, memory: memoryview, writer: RingWriter) -> None:
+        self._memory, self._writer = memory, writer
+
+    def __getitem__(self, place: slice) -> memoryview:
+        half = self._memory[place.start : place.start + 2].tobytes()
+        while self._writer.head < SLOTS + 1:
+            self._writer.put(payload(self._writer.head))
+        return memoryview(half + self._memory[place.start + 2 : place.stop].tobytes())
+
+    def release(self) -> None:
+        self._memory.release()
+
+
+def test_a_slot_overwritten_while_it_is_copied_is_lost_not_torn(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with RingWriter(path) as writer, RingReader(path) as reader:
+        writer.put(payload(0))
+        monkeypatch.setattr(reader, "_bytes", Racing(reader._bytes, writer))
+        assert reader.take() == payload(1)
+        assert reader.lost == 1
+
+
+def test_a_slot_that_is_being_overwritten_is_lost(path: Path) -> None:
     with RingWriter(path) as writer, RingReader(path) as reader:
         writer.put(payload(0))
         writer.put(payload(1))

@@ -1,4 +1,5 @@
-"""A bench for the core: parameters, made-up messages, a lockstep loop, and distances by other means than the product's."""
+"""A bench for the core: parameters, made-up messages, a lockstep loop, and distances by other means than the
+product's."""
 
 from __future__ import annotations
 
@@ -65,6 +66,7 @@ def make_params(tool: str = "drill") -> Params:
         dq_max=radians(joints["velocity_deg_s"]),
         ddq_max=radians(joints["acceleration_deg_s2"]),
         dddq_max=radians(joints["jerk_deg_s3"]),
+        effort=(),
         command_latency_ns=60_000_000,
         capsules=capsules(profile, None),
     )
@@ -76,6 +78,7 @@ def make_params(tool: str = "drill") -> Params:
     )
     return Params(
         period_ns=8_000_000,
+        control="acceleration",
         silence_cycles=12,
         tracking_tolerance=math.radians(8.0),
         robot=robot,
@@ -132,7 +135,8 @@ def make_inputs(joint: JointState | None, human: HumanState | None = FAR, tick: 
 
 
 def segment_distance(p0: Any, p1: Any, q0: Any, q1: Any) -> float:
-    """Distance of two segments: the best of the interior point of the lines and the four end points, by least squares."""
+    """Distance of two segments: the best of the interior point of the lines and the four end points, by least
+    squares."""
     p0, p1, q0, q1 = (np.asarray(x, dtype=float) for x in (p0, p1, q0, q1))
 
     def to_point(x: Any, a: Any, b: Any) -> float:
@@ -149,7 +153,8 @@ def segment_distance(p0: Any, p1: Any, q0: Any, q1: Any) -> float:
 
 
 def robot_capsules(system: System, q: Any) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
-    """(joint, p0, p1, radius) of every capsule in the base frame, placed by Pinocchio from the parameters' own figures."""
+    """(joint, p0, p1, radius) of every capsule in the base frame, placed by Pinocchio from the parameters' own
+    figures."""
     model, params = system.model.pin_model, system.params
     data = model.createData()
     pin.framesForwardKinematics(model, data, np.asarray(q, dtype=float))
@@ -176,7 +181,8 @@ def true_distance(system: System, q: Any, human: HumanState) -> float:
 
 
 def skew_arm() -> Params:
-    """Four joints about odd axes, a locked one between them, a capsule on the root, one on a fixed link and one on a link."""
+    """Four joints about odd axes, a locked one between them, a capsule on the root, one on a fixed link and one on a
+    link."""
     joints = [
         ("a", "root", "l1", "0.1 -0.2 0.3", "0.3 -0.4 0.5", "1 2 -3"),
         ("b", "l1", "l2", "0.2 0.1 0", "1.2 0 -0.7", "0 1 1"),
@@ -206,6 +212,7 @@ def skew_arm() -> Params:
         dq_max=four,
         ddq_max=(10.0, 10.0, 10.0, 10.0),
         dddq_max=(100.0, 100.0, 100.0, 100.0),
+        effort=(),
         command_latency_ns=0,
         capsules=(
             CapsuleSpec("root", (0.0, 0.0, 0.0), (0.0, 0.0, 0.2), 0.1),
@@ -234,7 +241,9 @@ People = Callable[[float], HumanState]  # true people at a time
 class Rig:
     """Controller and arm in one thread. The arm is where the set-point was one command latency ago."""
 
-    def __init__(self, system: System, people: People, start: Any = HOME, latency: float = 0.06, age: float = 0.03) -> None:
+    def __init__(
+        self, system: System, people: People, start: Any = HOME, latency: float = 0.06, age: float = 0.03
+    ) -> None:
         self.system, self.people, self.latency, self.age = system, people, latency, age
         self.state = initial(system)
         self.sent: deque[np.ndarray] = deque([np.array(start, dtype=float)] * 20, maxlen=20)

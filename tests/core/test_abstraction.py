@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from asc_rt.core.abstraction import People, Separation, radii, radius, separation
+from asc_rt.core.abstraction import People, Separation, radii, separation
 from asc_rt.core.kinematics import Chain
 from asc_rt.core.limits import acceleration_box
+from asc_rt.core.polytope import Polytope, greatest
 from asc_rt.core.robot_model import Capsules
 
 H = 2e-4  # s, of the oracle's differences
@@ -218,7 +219,7 @@ def test_touching_crossing_and_degenerate_capsules_stay_finite(bench: Any) -> No
                 people = People(q0[None], q1[None], moving, -moving, np.array([0.05]), np.array([0.1]))
                 args = (system.model.chain, system.model.capsules, people, q, np.full(6, 0.5))
                 found = separation(*args, np.inf, 3.0)
-                M, M_dot = radii(*args, np.full(6, 0.5), system.bounds, 3.0, found)
+                M, M_dot = radii(system.model.arm, *args[2:], np.full(6, 0.5), 3.0, found)
                 for column in (*found, M, M_dot):
                     assert np.all(np.isfinite(column))
 
@@ -227,13 +228,15 @@ def test_M_is_the_linear_program_over_the_acceleration_box(bench: Any) -> None:
     system = bench.system()
     for q, dq, ddq, people in motions(15, seed=4):
         found = separation(system.model.chain, system.model.capsules, people, q, dq, np.inf, 3.0)
-        M, _ = radii(system.model.chain, system.model.capsules, people, q, dq, ddq, system.bounds, 3.0, found)
+        M, _ = radii(system.model.arm, people, q, dq, ddq, 3.0, found)
         lower, upper = acceleration_box(system.bounds, q, dq)
         for C, drift, value in zip(found.C, found.drift, M, strict=True):
             best = linprog(-C, bounds=list(zip(lower, upper, strict=True)))
             assert best.status == 0
             assert value == pytest.approx(drift - best.fun, abs=1e-6)
-            assert radius(C, drift, lower, upper) == pytest.approx(value, abs=1e-9)
+            assert drift + greatest(
+                C, Polytope(lower, upper, np.zeros((0, 6)), np.zeros(0), np.zeros(0))
+            ) == pytest.approx(value, abs=1e-9)
 
 
 def M_along(system: Any, q: Any, dq: Any, ddq: Any, people: People, found: Separation, t: float) -> Any:
@@ -250,7 +253,7 @@ def test_M_dot_follows_M_and_takes_the_worse_side_of_a_kink(bench: Any) -> None:
     step = 1e-4
     for q, dq, ddq, people in motions(80, seed=6):
         found = separation(system.model.chain, system.model.capsules, people, q, dq, np.inf, 3.0)
-        _, M_dot = radii(system.model.chain, system.model.capsules, people, q, dq, ddq, system.bounds, 3.0, found)
+        _, M_dot = radii(system.model.arm, people, q, dq, ddq, 3.0, found)
         behind, now, ahead = (M_along(system, q, dq, ddq, people, found, t) for t in (-step, 0.0, step))
         left, right = (now - behind) / step, (ahead - now) / step
         curved = np.abs(right - left) > 2.0 + 0.02 * (np.abs(left) + np.abs(right))
@@ -277,7 +280,7 @@ def test_M_dot_at_a_kink_is_the_falling_side(bench: Any) -> None:
     people = People(person[None], person[None], still, still, np.array([0.05]), np.zeros(1))
     args = (system.model.chain, system.model.capsules, people, q, dq)
     found = separation(*args, np.inf, 3.0)
-    _, M_dot = radii(*args, np.zeros(6), system.bounds, 3.0, found)
+    _, M_dot = radii(system.model.arm, *args[2:], np.zeros(6), 3.0, found)
     i = int(np.argmax(found.robot == 7))
     step = 1e-4
     behind, now, ahead = (M_along(system, q, dq, np.zeros(6), people, found, t)[i] for t in (-step, 0.0, step))
@@ -293,7 +296,7 @@ def test_people_may_be_nobody(bench: Any) -> None:
     args = (system.model.chain, system.model.capsules, nobody, bench.HOME, np.zeros(6))
     found = separation(*args, np.inf, 3.0)
     assert len(found.d) == 0
-    assert [len(v) for v in radii(*args, np.zeros(6), system.bounds, 3.0, found)] == [0, 0]
+    assert [len(v) for v in radii(system.model.arm, *args[2:], np.zeros(6), 3.0, found)] == [0, 0]
 
 
 def test_inputs_are_left_alone(bench: Any) -> None:
@@ -301,6 +304,6 @@ def test_inputs_are_left_alone(bench: Any) -> None:
     q, dq, ddq, people = next(motions(1))
     copies = [np.copy(x) for x in (q, dq, *people)]
     found = separation(system.model.chain, system.model.capsules, people, q, dq, np.inf, 3.0)
-    radii(system.model.chain, system.model.capsules, people, q, dq, ddq, system.bounds, 3.0, found)
+    radii(system.model.arm, people, q, dq, ddq, 3.0, found)
     for before, after in zip(copies, (q, dq, *people), strict=True):
         np.testing.assert_array_equal(before, after)

@@ -1,4 +1,5 @@
-"""Stopping distance and joint bounds: against Ruckig's own plans, and in closed loop with an adversary at the bounds."""
+"""Stopping distance and joint bounds: against Ruckig's own plans, and in closed loop with an adversary at the
+bounds."""
 
 from __future__ import annotations
 
@@ -37,7 +38,9 @@ def test_stopping_distance_is_the_farthest_point_of_ruckigs_stop() -> None:
         farthest = max(0.0, plan.position_extrema[0].max)
         assert stopping_distance(v, a, A, J) == pytest.approx(farthest, rel=1e-6, abs=1e-9 * (1 + A**3 / J**2))
         v1 = v + a * a / (2 * J)
-        seen.add("turns" if a < 0 < v and v1 * J < a * a else "plateau" if v1 * J > A * A else "wedge" if v1 > 0 else "away")
+        seen.add(
+            "turns" if a < 0 < v and v1 * J < a * a else "plateau" if v1 * J > A * A else "wedge" if v1 > 0 else "away"
+        )
     assert seen == {"turns", "plateau", "wedge", "away"}
 
 
@@ -125,7 +128,9 @@ def test_no_control_in_the_box_ever_breaks_a_limit(bench: Any, robot: str, polic
         reached = max(reached, float(np.max(q / b.q_max)))
         if k % 20 == 0:
             stop = np.array([stopping_distance(*x) for x in zip(dq, ddq, b.ddq_max, b.dddq_max, strict=True)])
-            back = np.array([stopping_distance(-v, -a, A, J) for v, a, A, J in zip(dq, ddq, b.ddq_max, b.dddq_max)])
+            back = np.array(
+                [stopping_distance(-v, -a, A, J) for v, a, A, J in zip(dq, ddq, b.ddq_max, b.dddq_max, strict=True)]
+            )
             assert np.all(q + stop <= b.q_max + 1e-6) and np.all(q - back >= b.q_min - 1e-6)
     assert reached > 0.9  # the adversary did get to a limit
 

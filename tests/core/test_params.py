@@ -24,7 +24,13 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Any:
 
 def changed(value: Any, path: tuple[Any, ...]) -> Any:
     if not path:
-        return value + "x" if isinstance(value, str) else value + 1 if isinstance(value, int) else value + 1e-15 + value * 1e-12
+        return (
+            value + "x"
+            if isinstance(value, str)
+            else value + 1
+            if isinstance(value, int)
+            else value + 1e-15 + value * 1e-12
+        )
     head, *rest = path
     if isinstance(value, tuple):
         return tuple(changed(item, tuple(rest)) if i == head else item for i, item in enumerate(value))

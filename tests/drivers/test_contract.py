@@ -18,7 +18,10 @@ from drivers import registry
 from drivers.base import DriverError, HandshakeError, Pacing, RobotDriver, WireTap
 from sim_hil.fanuc.arm import KinematicPlant
 from sim_hil.fanuc.controller import Controller
-from sim_hil.fanuc.lockstep import Lockstep
+from sim_hil.fanuc.controller_b import ControllerB
+from sim_hil.fanuc.lockstep import Lockstep, RmiLine
+from sim_hil.fanuc.rmi import RmiServer
+from sim_hil.fanuc.settings import Settings
 
 PERIOD_NS = 8_000_000
 
@@ -38,6 +41,16 @@ def fanuc_j519(tap: WireTap | None) -> Peer:
     return Peer(driver, wire.now_ns, lambda: setattr(wire, "powered", False))
 
 
+def fanuc_stream_motion_b(tap: WireTap | None) -> Peer:
+    from drivers.fanuc_stream_motion.link_b import StreamMotionB
+
+    controller = ControllerB(KinematicPlant(np.zeros(6), PERIOD_NS * 1e-9), Settings(start_move=2, arm="crx_10ia_l"))
+    wire = Lockstep(controller)
+    line = RmiLine(wire, RmiServer(controller, 16002))
+    driver = StreamMotionB({"host": "127.0.0.1", "settle": 0.1}, tap, transport=wire, line=line)
+    return Peer(driver, wire.now_ns, lambda: setattr(wire, "powered", False))
+
+
 def loopback(tap: WireTap | None) -> Peer:
     from drivers.loopback import Loopback
 
@@ -45,8 +58,16 @@ def loopback(tap: WireTap | None) -> Peer:
     return Peer(driver, lambda: 0, lambda: setattr(driver, "_fault", "silence"))
 
 
-PEERS: dict[str, Callable[[WireTap | None], Peer]] = {"fanuc-j519": fanuc_j519, "loopback": loopback}
-OPTIONS: dict[str, dict[str, Any]] = {"fanuc-j519": {"host": "127.0.0.1"}, "loopback": {}}
+PEERS: dict[str, Callable[[WireTap | None], Peer]] = {
+    "fanuc-j519": fanuc_j519,
+    "fanuc-stream-motion-b": fanuc_stream_motion_b,
+    "loopback": loopback,
+}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "fanuc-j519": {"host": "127.0.0.1"},
+    "fanuc-stream-motion-b": {"host": "127.0.0.1"},
+    "loopback": {},
+}
 
 
 @pytest.fixture

@@ -11,10 +11,16 @@ from hypothesis import strategies as st
 
 from asc_rt.core.types import Vector
 from drivers.base import ProtocolError
-from drivers.fanuc_stream_motion import codec
+from drivers.fanuc_stream_motion import codec, packets
 from sim_hil.fanuc import wire
 
 HALF_TURN_DOWN = np.radians([0.0, 0.0, 0.0, 0.0, -90.0, 0.0])
+NAMES = {
+    packets.Status: "status",
+    packets.VersionReply: "version",
+    packets.Thresholds: "thresholds",
+    packets.Commanded: "commanded",
+}
 VERSIONS = st.sampled_from(codec.VERSIONS)
 SEQUENCES = st.integers(0, 2**32 - 1)
 AXES = st.lists(st.floats(-360, 360, width=32), min_size=9, max_size=9)
@@ -65,7 +71,7 @@ def test_golden_status() -> None:
     head = bytes.fromhex("00000000 00000001 00000001 05000000 00000000 000007d0")
     angles = [10.0, 20.0, -30.0, 40.0, 50.0, 60.0, 0.0, 0.0, 0.0]
     got = codec.decode(head + struct.pack(">9f", *[0.0] * 9) + struct.pack(">9f", *angles) + bytes(36), version=1)
-    assert isinstance(got, codec.Status)
+    assert isinstance(got, packets.Status)
     assert (got.seq, got.ready, got.servo_on, got.moving, got.t_ms) == (1, True, True, False, 2000)
     np.testing.assert_allclose(np.degrees(got.q), [10, 20, -10, 40, 50, 60], atol=1e-12)
 
@@ -113,7 +119,7 @@ def test_the_driver_reads_what_the_controller_means(
     got = codec.decode(
         status(version, sequence=seq, status=bits, time_stamp=t_ms, joints=axes, current=axes[::-1]), version
     )
-    assert isinstance(got, codec.Status)
+    assert isinstance(got, packets.Status)
     assert (got.seq, got.t_ms) == (seq, t_ms)
     assert (got.ready, got.servo_on, got.moving) == (bool(bits & 1), bool(bits & 4), bool(bits & 8))
     np.testing.assert_array_equal(got.current, axes[::-1][:6])
@@ -124,7 +130,7 @@ def test_the_driver_reads_what_the_controller_means(
 
 @given(SEQUENCES, st.integers(-(2**31), 2**31 - 1))
 def test_sequence_distance_is_the_signed_way_round_the_circle(seq: int, steps: int) -> None:
-    assert codec.sequence_distance((seq + steps) % 2**32, seq) == steps
+    assert packets.sequence_distance((seq + steps) % 2**32, seq) == steps
 
 
 # --- bad bytes -------------------------------------------------------------------------------------------------------
@@ -189,8 +195,8 @@ def test_any_reply_is_a_typed_error_or_one_that_the_controllers_codec_accepts(da
     except ProtocolError:
         return
     packet = wire.read_reply(data)
-    assert packet.name == ("status" if isinstance(got, codec.Status) else "version")
-    if isinstance(got, codec.Status):
+    assert packet.name == (NAMES[type(got)])
+    if isinstance(got, packets.Status):
         assert np.isfinite(got.q).all() and got.seq == packet["sequence"]
 
 

@@ -12,7 +12,7 @@ from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, 
 from drivers.base import HandshakeError, LinkError, ProtocolError, RobotFaulted, WriteReceipt
 from drivers.fanuc_stream_motion.link import StreamMotion
 from sim_hil.fanuc.arm import KinematicPlant
-from sim_hil.fanuc.controller import Controller
+from sim_hil.fanuc.controller import Controller, Program
 from sim_hil.fanuc.lockstep import Lockstep
 from sim_hil.fanuc.settings import Settings
 
@@ -73,6 +73,15 @@ class Rig:
 def there(k: int) -> Vector:
     """To START + MOVE in a second, at rest at both ends."""
     t = min(1.0, max(0.0, (k - 10) / 125))
+    return START + MOVE * float(t**3 * (10 - 15 * t + 6 * t**2))
+
+
+STRICT = Settings(limits=True)
+
+
+def slowly(k: int) -> Vector:
+    """To START + MOVE in two seconds: inside the limit tables, both conventions of J3."""
+    t = min(1.0, max(0.0, (k - 10) / 250))
     return START + MOVE * float(t**3 * (10 - 15 * t + 6 * t**2))
 
 
@@ -178,17 +187,41 @@ def test_what_an_earlier_session_left_in_the_socket_is_thrown_away() -> None:
     rig.driver.activate(PERIOD_NS)
 
 
-def test_stop_in_motion_leaves_it_to_the_controllers_silence_rule() -> None:
+@pytest.mark.parametrize("limits", [True, False])
+@pytest.mark.parametrize("version", [1, 3])
+def test_stop_in_motion_streams_a_jerk_limited_stop_and_says_goodbye(version: int, limits: bool) -> None:
+    rig = Rig(version, {"limits": limits}, STRICT)
+    rig.begin()
+    rig.run(100, slowly)
+    assert np.abs(rig.plant.dq).max() > 0.1
+    rig.driver.stop()
+    rig.wire.run(20)
+    assert rig.offences == []
+    np.testing.assert_allclose(rig.plant.dq, 0, atol=1e-4)
+    assert rig.sent[-1] == bytes.fromhex(f"000000020000000{version}")
+    assert [data[12] for data in rig.sent if data[3] in (1, 5)][-2:] == [0, 1]
+
+
+def test_stop_in_motion_with_the_answer_still_owed_answers_first() -> None:
+    rig = Rig(options={"limits": True}, settings=STRICT)
+    rig.begin()
+    rig.run(100, slowly)
+    rig.read()  # and then the decision raised
+    rig.driver.stop()
+    assert rig.offences == []
+    assert np.all(np.diff(rig.numbers()) == 1)
+
+
+def test_stop_in_motion_is_silence_if_the_robot_left_the_session() -> None:
     rig = Rig()
     rig.begin()
     rig.run(80, there)
-    moving = np.abs(rig.plant.dq).max()
-    assert moving > 0.1
+    rig.controller.press_emergency_stop()
+    rig.run(8, there)
+    before = len(rig.numbers())
     rig.driver.stop()
-    assert [alarm.number for alarm in rig.controller.alarms] == ["MOTN-603"]
-    np.testing.assert_array_equal(rig.plant.dq, 0)
+    assert len(rig.numbers()) == before
     assert rig.sent[-1] == bytes.fromhex("0000000200000003")
-    assert all(data[12] == 0 for data in rig.sent if data[3] == 5)
 
 
 # --- time and packets lost -------------------------------------------------------------------------------------------
@@ -374,3 +407,144 @@ def test_a_robot_without_servo_power_says_so() -> None:
 def test_wrong_options_are_named(options: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         StreamMotion(options)
+
+
+# --- limits ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_robots_tables_become_joint_limits_with_room_for_both_conventions_of_j3() -> None:
+    rig = Rig(options={"limits": True})
+    limits = rig.driver.configure().limits
+    assert limits is not None
+    table = np.array([500.0, 500.0, 700.0, 1100.0, 1100.0, 2000.0]) * 0.98
+    got = np.degrees(limits.ddq_max)
+    np.testing.assert_allclose(got[[0, 3, 4, 5]], table[[0, 3, 4, 5]], rtol=1e-5)
+    assert got[1] + got[2] == pytest.approx(table[2], rel=1e-5)
+    assert got[1] / got[2] == pytest.approx(5 / 7)
+    jerk = 0.98 * np.array([4000, 2000, 2000, 4000, 4000, 4000])
+    np.testing.assert_allclose(np.degrees(limits.dddq_max), jerk, rtol=1e-5)
+    assert rig.offences == [] and rig.controller.sequence == 0
+    assert Rig().driver.configure().limits is None
+
+
+def test_version_1_keeps_room_for_its_rounding() -> None:
+    exact, rounded = (Rig(version, {"limits": True}).driver.configure().limits for version in (2, 1))
+    assert exact is not None and rounded is not None
+    jerk = np.degrees(exact.dddq_max - rounded.dddq_max)
+    np.testing.assert_allclose(jerk[[0, 3, 4, 5]], 8 * 2.0**-16 / 0.008**3, rtol=1e-5)
+    rig = Rig(1, {"limits": True}, Settings(period_ms=2.0))
+    rig.driver.configure()
+    with pytest.raises(HandshakeError, match="too coarsely"):
+        rig.driver.activate(2_000_000)
+
+
+def test_payload_and_flange_speed_choose_the_place_in_the_tables() -> None:
+    def acceleration(**options: Any) -> float:
+        limits = Rig(options={"limits": True, **options}).driver.configure().limits
+        assert limits is not None
+        return float(np.degrees(limits.ddq_max[0])) / 0.98
+
+    assert acceleration(flange_speed=0.1) == pytest.approx(625)
+    assert acceleration(payload_share=0.0) == pytest.approx(650)
+    assert acceleration(flange_speed=4.4) == pytest.approx(500 * (1 - 2 * 0.25 / 19))
+
+
+@pytest.mark.parametrize("while_started", [True, False])
+def test_a_robot_that_does_not_tell_its_tables_is_refused_if_they_are_asked_for(while_started: bool) -> None:
+    rig = Rig(options={"limits": True}, settings=Settings(thresholds_while_waiting=False))
+    if while_started:  # some controllers answer only after Start
+        rig.wire.to_pc = lambda data: [data] if data[3] != 3 or rig.controller.sequence else []
+        rig.controller.program = Program.STOPPED
+        assert rig.driver.configure().limits is not None
+        return
+    with pytest.raises(HandshakeError, match="does not tell its limit tables") as caught:
+        rig.driver.configure()
+    assert "driver.limits = false" in caught.value.hint
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.98, False), (1.01, True)])
+def test_a_set_point_beyond_the_tables_is_never_sent(share: float, refused: bool) -> None:
+    rig = Rig(options={"limits": True}, settings=STRICT)
+    rig.begin()
+    rig.run(30)
+    before = len(rig.numbers())
+    rig.read()
+    q = START.copy()
+    q[3] += share * np.radians(4000.0) * 0.008**3
+    if not refused:
+        assert rig.write(q).ok
+        return
+    with pytest.raises(ProtocolError, match="MOTN-722.*J4 jerk 4040, the robot's limit is 3980 deg/s3"):
+        rig.write(q)
+    assert len(rig.numbers()) == before
+    rig.driver.stop()
+    assert rig.offences == []
+
+
+def test_a_first_set_point_away_from_the_arm_is_never_sent() -> None:
+    rig = Rig()
+    rig.begin()
+    rig.read()
+    with pytest.raises(ProtocolError, match="MOTN-625.*1 deg from where the arm is"):
+        rig.write(START + np.radians(1.0))
+    assert rig.numbers() == []
+
+
+# --- what the robot tells --------------------------------------------------------------------------------------------
+
+
+def test_the_commanded_position_can_be_asked_before_the_first_command() -> None:
+    rig = Rig()
+    rig.begin()
+    q = rig.driver.commanded(rig.wire.now_ns() + 10 * PERIOD_NS)
+    assert q is not None
+    np.testing.assert_allclose(q, START, atol=1e-6)
+    assert rig.driver.commanded(rig.wire.now_ns() + 2 * PERIOD_NS) is None  # too soon for this robot
+
+
+def test_the_tool_is_read_from_its_signals() -> None:
+    rig = Rig(options={"tool_input": "RI[3:6]"}, settings=Settings(tool=5))
+    assert rig.begin().tool_id == 0  # a session has to begin for that
+    assert rig.run(10)[-1].tool_id == 5
+    rig.controller.signals.couple(9)
+    assert rig.run(2)[-1].tool_id == 9
+
+
+def test_motor_currents_arrive() -> None:
+    rig = Rig()
+    rig.plant.torque = np.full(6, 100.0)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(rig.begin().current, [0.8, 0.8, 2.0, 5.7, 10.0, 20.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("happens", "says"),
+    [
+        (lambda rig: rig.controller.press_emergency_stop(), "servo power went off"),
+        (lambda rig: rig.controller.enable_pendant(), "left the session"),
+        (lambda rig: (rig.run(5), rig.wire.run(3), rig.run(1), rig.wire.run(8)), "probably MOTN-603"),
+        (lambda rig: rig.controller.jump_sequence(1), "counts its statuses anew"),
+    ],
+)
+def test_a_lost_session_says_why_and_what_to_do(happens: Callable[[Rig], None], says: str) -> None:
+    rig = Rig()
+    rig.begin()
+    rig.run(30)
+    assert rig.driver.fault is None
+    happens(rig)
+    assert RobotFlag.FAULTED in rig.run(20)[-1].flags
+    assert says in str(rig.driver.fault) and rig.driver.fault and rig.driver.fault.hint
+
+
+def test_thinned_statuses_are_not_missing() -> None:
+    rig = Rig(settings=Settings(thinning=4, brake_deg_s2=100.0))
+    rig.begin()
+    rig.run(80, there)
+    rig.wire.to_robot = lambda data: []
+    rig.run(30, there)
+    assert rig.controller.alarms and rig.driver.counters.missing <= 3  # before the first thinned one told so
+
+
+@pytest.mark.parametrize("text", ["RI[3]", "RI[0:1]", "RI[4:3]", "RI[1:17]", "AI[1:2]"])
+def test_a_wrong_row_of_signals_is_named(text: str) -> None:
+    with pytest.raises(ValueError, match="tool_input must be a row of signals"):
+        StreamMotion({"host": "robot", "tool_input": text})

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from asc_rt.config import load_cell
 from asc_rt.core.params import Params
@@ -37,8 +38,8 @@ from asc_rt.core.types import (
 from asc_rt.record import RecordLayout, Timings
 from drivers.base import WriteReceipt
 from logs import schema
+from logs.context import attachments, session
 from logs.log_file import LogFile
-from logs.writer import attachments, session
 
 PERIOD_NS = 8_000_000
 T0_NS = 5_000_000_000
@@ -124,6 +125,7 @@ class Recording:
         out = []
         for cycle in cycles:
             self.layout.pack(buffer, *cycle)
+            self.layout.seal(buffer)
             out.append(bytes(buffer))
         return out
 
@@ -132,22 +134,28 @@ class Recording:
         records: list[bytes],
         messages: list[tuple[schema.Channel, int, dict[str, Any]]] = [],  # noqa: B006
         wire: bool = True,
+        without: tuple[schema.Channel, int] | None = None,
         close: bool = True,
         fingerprint: dict[str, Any] | None = None,
+        key: Ed25519PrivateKey | None = None,
     ) -> Path:
         path = next(self._names)
         files = attachments(self.cell)
         if fingerprint is not None:
             files[schema.FINGERPRINT] = json.dumps(fingerprint).encode()
-        log = LogFile(path, files, session(self.cell))
+        # These packets are no robot's: a driver without a codec to check them with.
+        about = {**session(self.cell), "driver": json.dumps({"name": "loopback"})}
+        log = LogFile(path, files, about, key=key)
         for k, record in enumerate(records):
             row = np.frombuffer(record, self.layout.dtype)[0]
             log.message(schema.CYCLE, T0_NS + k * PERIOD_NS, record)
             if wire:
                 rx, tx = int(row["inputs.joint.t_rx_ns"]), int(row["receipt.t_tx_ns"])
-                log.message(schema.WIRE_RX, rx, schema.wire_message(rx, 3, b"abc"))
-                log.message(schema.WIRE_TX, tx, schema.wire_message(tx, 3, b"xyz"))
+                for channel, t_ns in ((schema.WIRE_RX, rx), (schema.WIRE_TX, tx)):
+                    if (channel, k) != without:
+                        log.message(channel, t_ns, schema.wire_message(t_ns, 3, b"abc"))
             if k % 6 == 5:
+                log._next_seal_ns = 0  # as if a second had passed
                 log.flush()
         for channel, t_ns, value in messages:
             log.json(channel, t_ns, value)

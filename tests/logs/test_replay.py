@@ -10,6 +10,7 @@ import pytest
 
 from asc_rt.core.params import Params
 from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs, vector
+from logs import schema
 from logs.diff import altered, differences
 from logs.reader import open_log
 from logs.replay import Order, Stepper, replay
@@ -189,7 +190,13 @@ def test_another_machine_is_compared_with_a_tolerance_and_told(recording: Any, d
     assert replay(path, stepper=changed_from(5, much, decision)).mismatches == 5
 
 
-def test_packets_that_are_missing_or_otherwise_are_wire_mismatches(recording: Any, decision: Decision) -> None:
+@pytest.mark.parametrize("channel", [schema.WIRE_RX, schema.WIRE_TX])
+def test_missing_packets_are_wire_mismatches(recording: Any, decision: Decision, channel: schema.Channel) -> None:
+    path = recording.write(recording.packed(recording.cycles(10)), without=(channel, 4))
+    assert replay(path, stepper=decision).wire_mismatches == 1
+
+
+def test_what_was_sent_otherwise_is_a_wire_mismatch(recording: Any, decision: Decision) -> None:
     cycles = recording.cycles(10)
     state, x, out, receipt, timings = cycles[7]
     cycles[7] = (state, x, out, dataclasses.replace(receipt, q=vector(receipt.q + 1e-3)), timings)

@@ -1,15 +1,20 @@
 """The real decision, recorded and run again: not a bit may differ."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from asc_rt.core.params import Params
 from asc_rt.core.step import step
 from asc_rt.core.system import System, initial
 from asc_rt.core.types import (
+    CoreState,
+    CycleInputs,
+    CycleOutputs,
     EventKind,
     Goal,
     Health,
@@ -23,7 +28,10 @@ from asc_rt.core.types import (
 )
 from asc_rt.record import Timings
 from drivers.base import WriteReceipt
-from logs.replay import Order, replay
+from logs.commands import told
+from logs.reader import open_log
+from logs.replay import Order, core_stepper, replay
+from logs.whatif import _stop_changes, what_if
 
 
 def approaching(t_ns: int, seq: int) -> HumanState:
@@ -68,10 +76,70 @@ def test_the_core_replays_to_the_bit(session: tuple[Path, list[Any]]) -> None:
         assert (report.cycles, report.mismatches, report.exact) == (150 - start, 0, True)
 
 
-def test_other_parameters_decide_otherwise(recording: Any, session: tuple[Path, list[Any]]) -> None:
-    path, _ = session
-    safety = dataclasses.replace(recording.params.safety, d_min=0.2)
-    report = replay(path, params=dataclasses.replace(recording.params, safety=safety))
-    assert report.mismatches > 0
-    assert report.first_difference is not None
-    assert report.first_difference.field.startswith("outputs.decision.")
+def test_several_processes_give_the_same_verdict(session: tuple[Path, list[Any]]) -> None:
+    assert replay(session[0], jobs=2).as_dict() == replay(session[0]).as_dict()
+
+
+def with_d_min(params: Params, d_min: float) -> Params:
+    return dataclasses.replace(params, safety=dataclasses.replace(params.safety, d_min=d_min))
+
+
+def test_what_if_nothing_changes_then_nothing_differs(session: tuple[Path, list[Any]]) -> None:
+    log = open_log(session[0])
+    found = what_if(log, core_stepper(log.params), log.params)
+    assert (found.cycles, found.differing, found.first, found.ended) == (150, 0, None, "")
+    assert found.waveforms == {}
+    assert told({**found.as_dict()}) == ["150 cycles, nothing differs"]
+
+
+def test_what_if_the_distance_were_another(session: tuple[Path, list[Any]]) -> None:
+    log = open_log(session[0])
+    params = with_d_min(log.params, 0.2)
+    found = what_if(log, core_stepper(params), params)
+    assert found.first is not None
+    assert found.first["field"].startswith("outputs.decision.")
+    assert found.differing > 0
+    assert found.fields["outputs.decision.pairs.phi"].largest > 0.01
+    assert "greatest phi" in found.waveforms
+    assert json.dumps(found.as_dict(), allow_nan=False)
+    assert told(found.as_dict())[1].startswith("first: cycle ")
+
+
+def test_what_if_goes_on_from_its_own_state(session: tuple[Path, list[Any]]) -> None:
+    """A change of one cycle reaches the later ones, which a replay must not show."""
+    log = open_log(session[0])
+    decide = core_stepper(log.params)
+
+    def nudged(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
+        after, out = decide(state, x)
+        return (dataclasses.replace(after, event_id=77) if x.tick == 40 else after), out
+
+    found = what_if(log, nudged, log.params)
+    assert found.fields["state.event_id"].cycles == 150 - 41
+
+
+def test_code_that_raises_ends_the_what_if_and_says_where(session: tuple[Path, list[Any]]) -> None:
+    log = open_log(session[0])
+    decide = core_stepper(log.params)
+
+    def broken(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
+        if x.tick == 30:
+            raise ZeroDivisionError("by zero")
+        return decide(state, x)
+
+    found = what_if(log, broken, log.params)
+    assert (found.cycles, found.ended) == (30, "cycle 30: ZeroDivisionError: by zero")
+
+
+def test_stops_are_told_by_what_becomes_of_them() -> None:
+    def stop(reason: str, t_s: float) -> dict[str, Any]:
+        return {"reason": reason, "t_s": t_s}
+
+    logged = [stop("HUMAN_STALE", 3.2), stop("LATE", 5.0), stop("GATE", 6.0)]
+    replayed = [stop("HUMAN_STALE", 3.224), stop("GATE", 6.0), stop("INFEASIBLE", 7.5)]
+    assert _stop_changes(logged, replayed) == [
+        "HUMAN_STALE at 3.200 s: stops 24 ms later",
+        "LATE at 5.000 s: does not stop",
+        "GATE at 6.000 s: stops at the same time",
+        "INFEASIBLE at 7.500 s: stops, and did not",
+    ]

@@ -18,9 +18,10 @@ from asc_rt import ring, topics
 from asc_rt.bus import open_router
 from asc_rt.human_state_pb2 import HumanState
 from logs import schema
-from logs.log_file import LogFile
+from logs.context import attachments, session
 from logs.reader import open_log
-from logs.writer import FLUSH_NS, Logger, attachments, session, state_message
+from logs.session_files import SessionFiles
+from logs.writer import FLUSH_NS, Logger, state_message
 
 
 class Clock:
@@ -42,8 +43,8 @@ def session_ring(recording: Any, tmp_path: Path) -> Iterator[Path]:
 
 def logger(recording: Any, path: Path, out: Path, clock: Clock) -> tuple[Logger, ring.RingReader]:
     cycles, wire = ring.RingReader(path), ring.RingReader(ring.wire_path(path))
-    log = LogFile(out, attachments(recording.cell), session(recording.cell))
-    return Logger(log, recording.layout, cycles, wire, None, clock), cycles
+    log = SessionFiles(out, attachments(recording.cell), session(recording.cell))
+    return Logger(log, recording.layout, cycles, wire, None, clock=clock), cycles
 
 
 def test_rings_become_channels(recording: Any, session_ring: Path, tmp_path: Path) -> None:
@@ -59,6 +60,8 @@ def test_rings_become_channels(recording: Any, session_ring: Path, tmp_path: Pat
         assert not made.finished
     assert made.finished
     made.finish("session closed")
+    with ring.RingWriter(session_ring) as cycles:
+        assert cycles.backlog == 0
     log = open_log(tmp_path / "a.mcap")
     assert [log.record(i) for i in range(log.cycles)] == packed
     packets = {
@@ -195,7 +198,7 @@ def test_bad_input_is_one_clear_line(recording: Any, session_ring: Path, tmp_pat
     cases = {
         "no such cell file": ["--cell", "none.toml"],
         "made by the session's supervisor": ["--ring", str(tmp_path / "none")],
-        "nobody listens": ["--set", f"bus.endpoint={free_endpoint()}"],
+        "bus.endpoint": ["--set", "bus.endpoint=nowhere"],
     }
     started = {want: start(session_ring, tmp_path / "a.mcap", *options) for want, options in cases.items()}
     for want, process in started.items():

@@ -164,7 +164,7 @@ def test_nobody_there(arm_params: MakeParams) -> None:
     assert plant.contacts == ()
 
 
-def test_contact_is_seen_the_person_stays_and_the_arm_stays_calm(arm_params: MakeParams) -> None:
+def test_contact_is_seen_and_pushes_neither_the_person_nor_the_arm(arm_params: MakeParams) -> None:
     params, sweep = arm_params("drill"), np.array([1.2, 0, 0, 0, 0, 0])
     plant = MujocoPlant(params, READY)
     _, a0, a1 = robot_capsules(params, READY + sweep / 2)[-2]  # the drill's body on its way
@@ -179,8 +179,8 @@ def test_contact_is_seen_the_person_stays_and_the_arm_stays_calm(arm_params: Mak
         fastest, deepest = max(fastest, float(np.abs(plant.dq).max())), min(deepest, nearest.distance)
     assert not touched[0] and any(touched)
     assert deepest < 0
-    assert fastest < 20, "the arm is pushed, not thrown"
-    assert plant.q == pytest.approx(READY + sweep, abs=1.0)
+    assert fastest < 1.3, "nobody pushes the arm"
+    assert plant.q == pytest.approx(READY + sweep, abs=0.01)
 
 
 def test_contact_names_parts_and_depth_and_follows_a_capsule_that_grows(arm_params: MakeParams) -> None:

@@ -1,0 +1,123 @@
+"""The commands of `asc` that read recordings: replay, recover, audit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+Show = Callable[[dict[str, Any], bool], None]
+Refuse = Callable[[str], NoReturn]
+
+Recording = Annotated[Path, typer.Argument(metavar="LOG", help="recording, .mcap")]
+AsJson = Annotated[bool, typer.Option("--json", help="one JSON object as the last line of stdout")]
+
+
+def register(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Callable[[], None]) -> None:
+    """`show` prints a result, `refuse` ends the program for bad input, `limit_blas` has it compute as the loop does."""
+
+    @app.command()
+    def replay(
+        log: Recording,
+        start: Annotated[int, typer.Option("--from", help="number of the first cycle to run again", metavar="N")] = 0,
+        jobs: Annotated[int, typer.Option("-j", "--jobs", help="processes; 0: one for each core", min=0)] = 1,
+        reverse: Annotated[bool, typer.Option("--reverse", help="last cycle first")] = False,
+        diff: Annotated[
+            bool, typer.Option("--diff", help="let the session go on from its own states, and tell what differs")
+        ] = False,
+        overrides: Annotated[
+            list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="what if: another value of [safety]")
+        ] = None,
+        as_json: AsJson = False,
+    ) -> None:
+        """Run every recorded decision again and compare the bytes. Example: asc replay runs/latest.mcap -j 0"""
+        limit_blas()
+        if overrides or diff:
+            _what_if(log, overrides or [], as_json, show)
+            return
+        from logs.replay import Order, core_stepper
+        from logs.replay import replay as replay_log
+
+        order = Order.REVERSE if reverse else Order.FORWARD
+        try:
+            report = replay_log(
+                log, start, order, stepper=core_stepper, jobs=jobs or os.cpu_count() or 1, progress=_bar()
+            )
+        except IndexError as error:
+            refuse(f"--from: {error}")
+        show(report.as_dict(), as_json)
+        raise typer.Exit(0 if report.mismatches == 0 and report.wire_mismatches == 0 else 1)
+
+    @app.command()
+    def recover(
+        log: Recording,
+        out: Annotated[Path, typer.Option("-o", "--out", help="file to write; must not exist")],
+        ring: Annotated[
+            Path | None, typer.Option(help="the session's ring, /dev/shm/asc-...: what it still holds is added")
+        ] = None,
+        key: Annotated[Path | None, typer.Option(help="key that sealed the session; default: your own")] = None,
+        as_json: AsJson = False,
+    ) -> None:
+        """Close a recording that a crash left open. Example: asc recover runs/crashed.mcap -o runs/whole.mcap"""
+        from logs.recover import recover as recover_log
+        from logs.seal import KeyFileError, default_key_file, load_key
+
+        try:
+            signer = load_key(key) if key is not None or default_key_file().exists() else None
+        except KeyFileError as error:
+            refuse(f"{error}; {error.hint}")
+        show(recover_log(log, out, ring, signer).as_dict(), as_json)
+
+
+def _what_if(path: Path, overrides: list[str], as_json: bool, show: Show) -> None:
+    """Exit code 0: a difference is what was asked for."""
+    from asc_rt.config import what_if as changed
+    from logs.reader import open_log
+    from logs.replay import core_stepper
+    from logs.whatif import what_if
+
+    log = open_log(path)
+    params = changed(log.params, overrides) if overrides else log.params
+    found = what_if(log, core_stepper(params), params, progress=_bar())
+    first = found.first
+    result = {
+        "cycles": found.cycles,
+        "mismatches": found.differing,
+        "exact": found.differing == 0,
+        "first_difference": None if first is None else {k: v for k, v in first.items() if k != "t_s"},
+        **found.as_dict(),
+    }
+    if as_json:
+        show(result, True)
+        return
+    for line in told(result):
+        print(line)
+
+
+def told(found: dict[str, Any]) -> list[str]:
+    """A what-if in words."""
+    first = found["first"]
+    if first is None:
+        return [f"{found['cycles']} cycles, nothing differs"]
+    where = f"cycle {first['cycle']}, {first['t_s']:.3f} s"
+    lines = [
+        f"{found['differing']} of {found['cycles']} cycles differ",
+        f"first: {where}: {first['field']}: {first['logged']} -> {first['replayed']}",
+    ]
+    lines += [f"stop   {line}" for line in found["stops"]] or ["stops  none, before and now"]
+    if found["ended"]:
+        lines.append(f"ended  {found['ended']}")
+    for name, change in found["fields"].items():
+        largest = "" if change["largest"] is None else f"by up to {change['largest']:.3g} (cycle {change['at']})"
+        lines.append(f"{name:36} {change['cycles']:8} cycles {largest}")
+    return lines
+
+
+def _bar() -> Any:
+    from tqdm import tqdm
+
+    return partial(tqdm, unit=" cycles", disable=None)

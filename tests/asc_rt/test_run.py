@@ -1,0 +1,145 @@
+"""`asc run`, whole: every process, the real wire, and what happens when one of them dies. Nothing here is timed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ASC = [sys.executable, "-m", "asc_rt"]
+KEYS = {
+    "cycles", "period_ms", "missed_deadlines", "cycle_us", "wake_us", "min_distance_m", "robot_caused_violations",
+    "infeasible_cycles", "goals_reached", "stops", "dropped_records", "log", "exit_reason",
+}  # fmt: skip
+
+pytestmark = pytest.mark.timeout(120)
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Run:
+    """A running `asc run --json` on ports of its own."""
+
+    def __init__(self, folder: Path, duration: float, port: int | None = None) -> None:
+        self.log = folder / "log.mcap"
+        self.port = port or free_port(socket.SOCK_DGRAM)
+        bus = free_port(socket.SOCK_STREAM)
+        settings = [f"driver.port={self.port}", f"bus.endpoint=tcp/127.0.0.1:{bus}", "human.age_limit_ms=900"]
+        command = [*ASC, "run", "--json", "--duration", str(duration), "--log", str(self.log)]
+        for setting in settings:
+            command += ["--set", setting]
+        self._err = folder / "stderr"
+        with self._err.open("wb") as err:
+            self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=err)
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    def await_text(self, text: str) -> None:
+        deadline = time.monotonic() + 90
+        while text not in self.err:
+            assert self.process.poll() is None, self.err
+            assert time.monotonic() < deadline, self.err
+            time.sleep(0.05)
+
+    def kill(self, module: str) -> None:
+        """SIGKILL to the child process that runs `module`."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        (pid,) = [int(c) for c in children if module in Path(f"/proc/{c}/cmdline").read_text().replace("\0", " ")]
+        os.kill(pid, signal.SIGKILL)
+
+    def finish(self) -> tuple[int, dict[str, Any]]:
+        out, _ = self.process.communicate(timeout=90)
+        assert "Traceback" not in self.err
+        assert not [name for name in os.listdir("/dev/shm") if str(self.process.pid) in name], self.err
+        return self.process.returncode, json.loads(out.decode().splitlines()[-1]) if out else {}
+
+
+@contextmanager
+def running(folder: Path, duration: float, port: int | None = None) -> Iterator[Run]:
+    run = Run(folder, duration, port)
+    try:
+        yield run
+    finally:
+        run.process.terminate()
+        run.process.wait(60)
+
+
+def replay(log: Path) -> dict[str, Any]:
+    done = subprocess.run([*ASC, "replay", str(log), "--json"], cwd=ROOT, capture_output=True, text=True)
+    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, told
+    return told
+
+
+def test_the_cell_runs_ends_and_replays_to_the_byte(tmp_path: Path) -> None:
+    with running(tmp_path, 6) as run:
+        code, told = run.finish()
+    assert code == 0, run.err
+    assert told.keys() >= KEYS
+    assert told["exit_reason"] == "completed" and told["robot_caused_violations"] == 0
+    assert told["dropped_records"] == 0 and told["cycles"] > 300 and told["processes_lost"] == []
+    again = replay(run.log)
+    assert again["exact"] and again["mismatches"] == 0 and again["cycles"] == told["cycles"]
+
+
+def test_without_a_person_publisher_the_robot_rests_and_nothing_arms_it_again(tmp_path: Path) -> None:
+    with running(tmp_path, 8) as run:
+        run.await_text("ACTIVE")
+        run.kill("sim_hil human")
+        run.await_text("STOPPED (HUMAN_STALE)")
+        code, told = run.finish()
+    assert code == 0 and told["exit_reason"] == "completed"  # it waits for a person until it is asked to end
+    assert told["stops"][-1]["reason"] == "HUMAN_STALE"
+    assert "ACTIVE" not in run.err.rpartition("STOPPED (HUMAN_STALE)")[2]
+
+
+def test_a_dead_controller_leaves_the_robot_to_its_own_rule_and_a_whole_log(tmp_path: Path) -> None:
+    with running(tmp_path, 60) as run:
+        run.await_text("ACTIVE")
+        run.kill("asc_rt.control")
+        code, told = run.finish()
+    assert code == 1 and told["exit_reason"] == "CONTROL_DIED"
+    assert "Receiving interval over" in run.err  # the simulated robot stopped itself, and says why
+    assert told["dropped_records"] == 0 and not told["truncated"]
+    assert replay(run.log)["exact"]
+
+
+def test_a_dead_robot_ends_the_session_with_its_reason_and_a_whole_log(tmp_path: Path) -> None:
+    with running(tmp_path, 60) as run:
+        run.await_text("ACTIVE")
+        run.kill("sim_hil fanuc")
+        code, told = run.finish()
+    assert code == 1 and told["exit_reason"] == "ROBOT_SILENT"
+    assert told["dropped_records"] == 0 and not told["truncated"]
+    assert replay(run.log)["exact"]
+
+
+def test_ctrl_c_ends_cleanly_and_a_second_session_is_refused_meanwhile(tmp_path: Path) -> None:
+    with running(tmp_path, 60) as run:
+        run.await_text("HOLD")
+        other = tmp_path / "other"
+        other.mkdir()
+        with running(other, 5, port=run.port) as second:
+            second_code, _ = second.finish()
+        assert second_code == 2 and f":{run.port}" in second.err
+        run.process.send_signal(signal.SIGINT)
+        code, told = run.finish()
+    assert code == 0 and told["exit_reason"] == "completed" and not told["truncated"]

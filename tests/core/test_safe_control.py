@@ -1,0 +1,150 @@
+"""The QP against another solver, and its word on what cannot be solved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog, minimize
+
+from asc_rt.core.polytope import Polytope
+from asc_rt.core.safe_control import Solution, solve
+
+SCALE = np.array([8.7, 8.7, 12.0, 19.0, 19.0, 35.0])
+
+
+def box(lower: Any, upper: Any) -> Polytope:
+    return Polytope(lower, upper, np.zeros((0, len(lower))), np.zeros(0), np.zeros(0))
+
+
+def ask(u_ref: Any, C: Any, floor: Any, lower: Any, upper: Any) -> Solution:
+    """Rows without a share."""
+    return solve(u_ref, C, floor, floor, box(lower, upper), SCALE)
+
+
+def problems(count: int, seed: int = 0, rows: int = 8) -> Any:
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        centre = rng.uniform(-0.5, 0.5, 6) * SCALE
+        half = rng.uniform(0.02, 0.5, 6) * SCALE
+        C = rng.normal(0.0, 0.5, (rows, 6)) * 10.0 ** rng.uniform(-2.0, 0.0, (rows, 1))  # also links that hardly move
+        yield (
+            rng.uniform(-1.0, 1.0, 6) * SCALE,
+            C,
+            C @ centre + rng.normal(0.0, 2.0, rows) * np.abs(C).max(axis=1),
+            centre - half,
+            centre + half,
+        )
+
+
+def possible(C: Any, floor: Any, lower: Any, upper: Any) -> float:
+    """Largest common margin of all rows, by linear programming; negative: infeasible."""
+    best = linprog(
+        np.append(np.zeros(6), -1.0),
+        A_ub=np.hstack((-C, np.ones((len(C), 1)))),
+        b_ub=-floor,
+        bounds=[*zip(lower, upper, strict=True), (-100.0, 100.0)],
+    )
+    return float(-best.fun)
+
+
+def test_the_control_is_the_closest_that_keeps_everything() -> None:
+    solved = 0
+    for u_ref, C, floor, lower, upper in problems(150):
+        margin = possible(C, floor, lower, upper)
+        found = ask(u_ref, C, floor, lower, upper)
+        if abs(margin) < 1e-3:
+            continue
+        assert found.feasible == (margin > 0.0)
+        if not found.feasible:
+            continue
+        assert np.all(C @ found.u >= floor) and np.all((lower <= found.u) & (found.u <= upper))
+        other = minimize(
+            lambda x, r=u_ref: float(np.sum((x - r / SCALE) ** 2)),
+            0.5 * (lower + upper) / SCALE,
+            jac=lambda x, r=u_ref: 2.0 * (x - r / SCALE),
+            bounds=list(zip(lower / SCALE, upper / SCALE, strict=True)),
+            constraints={
+                "type": "ineq",
+                "fun": lambda x, C=C, f=floor: C @ (x * SCALE) - f,
+                "jac": lambda x, C=C: C * SCALE,
+            },
+            method="SLSQP",
+            options={"ftol": 1e-12, "maxiter": 200},
+        )
+        if not other.success:
+            continue
+        np.testing.assert_allclose(found.u / SCALE, other.x, atol=2e-4)
+        solved += 1
+    assert solved > 60
+
+
+def test_rows_in_conflict_are_infeasible() -> None:
+    C = np.array([[1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0, 0, 0]])
+    found = ask(np.zeros(6), C, np.array([0.5, 0.5]), -SCALE, SCALE)
+    assert not found.feasible
+    assert ask(np.zeros(6), C, np.array([0.5, -0.6]), -SCALE, SCALE).feasible
+
+
+@pytest.mark.parametrize("floor", [np.nan, np.inf])
+def test_a_floor_that_is_no_number_is_infeasible_even_alone(floor: float) -> None:
+    C = np.ones((1, 6))
+    assert not ask(np.zeros(6), C, np.array([floor]), -SCALE, SCALE).feasible
+    assert not ask(np.zeros(6), np.zeros((1, 6)), np.array([floor]), -SCALE, SCALE).feasible
+
+
+@pytest.mark.parametrize("where", ["C", "u_ref"])
+def test_what_is_no_number_is_infeasible(where: str) -> None:
+    C, u_ref = np.ones((1, 6)), np.zeros(6)
+    (C[0] if where == "C" else u_ref)[2] = np.nan
+    assert not ask(u_ref, C, np.array([0.1]), -SCALE, SCALE).feasible
+    if where == "u_ref":
+        assert not ask(u_ref, np.zeros((0, 6)), np.zeros(0), -SCALE, SCALE).feasible
+
+
+def test_without_a_binding_row_the_reference_passes_or_meets_the_box() -> None:
+    inside = ask(0.1 * SCALE, np.ones((1, 6)), np.array([-1e3]), -SCALE, SCALE)
+    assert inside.feasible and not inside.filtered
+    np.testing.assert_array_equal(inside.u, 0.1 * SCALE)
+    outside = ask(9.0 * SCALE, np.zeros((0, 6)), np.zeros(0), -SCALE, SCALE)
+    np.testing.assert_array_equal(outside.u, SCALE)
+
+
+def test_rows_that_nothing_in_the_box_can_violate_change_no_bit() -> None:
+    for u_ref, C, floor, lower, upper in problems(40, seed=1, rows=4):
+        idle = np.random.default_rng(0).normal(0.0, 1.0, (20, 6))
+        beneath = np.minimum(idle * lower, idle * upper).sum(axis=1) - 0.1
+        alone = ask(u_ref, C, floor, lower, upper)
+        crowded = ask(u_ref, np.vstack((idle, C)), np.concatenate((beneath, floor)), lower, upper)
+        assert alone.feasible == crowded.feasible
+        if alone.feasible:
+            np.testing.assert_array_equal(alone.u, crowded.u)
+
+
+def test_equal_problems_have_equal_bytes_whatever_was_solved_between() -> None:
+    cases = list(problems(12, seed=2))
+    first = [ask(*case) for case in cases]
+    again = [ask(*case) for case in reversed(cases)][::-1]
+    assert [s.u.tobytes() for s in first] == [s.u.tobytes() for s in again]
+
+
+def test_a_box_of_no_width_is_still_solved() -> None:
+    point = 0.2 * SCALE
+    C = np.array([[1.0, 0, 0, 0, 0, 0]])
+    assert ask(np.zeros(6), C, np.array([point[0] - 0.1]), point, point).feasible
+    assert not ask(np.zeros(6), C, np.array([point[0] + 0.1]), point, point).feasible
+
+
+def test_rows_with_a_share_give_way_and_the_others_do_not() -> None:
+    """Two people, one on each side, both faster than the arm; and a row of the index, which holds."""
+    C = np.array([[1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0]])
+    floor, base = np.array([2.0, 1.0, 3.0]), np.array([-0.5, -0.5, 3.0])
+    found = solve(np.zeros(6), C, floor, base, box(-SCALE, SCALE), SCALE)
+    assert found.feasible and found.filtered
+    assert 0.0 < found.share < 1.0
+    assert found.share == pytest.approx(1.0 / 4.0, abs=1e-3)  # -0.5 + 2.5 s <= u <= 0.5 - 1.5 s
+    assert np.all(C @ found.u >= base + found.share * (floor - base) - 1e-9)
+    assert found.u[1] >= 3.0
+    stubborn = solve(np.zeros(6), C, floor, floor, box(-SCALE, SCALE), SCALE)
+    assert not stubborn.feasible
