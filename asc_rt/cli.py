@@ -18,6 +18,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from asc_rt.synthesis import command as synthesis
 from logs import commands
 
 DEFAULT_CELL = "fanuc-sim"
@@ -96,6 +97,14 @@ def sim(
     changes = [*(overrides or []), *([f"driver.port={port}"] if port is not None else [])]
     config = load_cell(cell, changes)
     raise typer.Exit(run_device(config, device.value, ["--strict"] if strict else []))
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+def trials(ctx: typer.Context) -> None:
+    """Seeded trials in simulation, beside the same without the filter. Example: asc trials table1 -n 20"""
+    from asc_rt.trials import run_trials
+
+    raise typer.Exit(run_trials(ctx.args))
 
 
 @app.command()
@@ -251,6 +260,7 @@ def _limit_blas() -> None:
 
 
 commands.register(app, _show, _refuse, lambda: _limit_blas())
+synthesis.register(app, _show, _refuse)
 
 if __name__ == "__main__":
     main()

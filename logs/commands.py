@@ -19,7 +19,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="one JSON object as the las
 
 def register(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Callable[[], None]) -> None:
     """`show` prints a result, `refuse` ends the program for bad input, `limit_blas` has it compute as the loop does."""
+    _register_replay(app, show, refuse, limit_blas)
+    _register_recover(app, show, refuse)
+    _register_audit(app, show, refuse, limit_blas)
 
+
+def _register_replay(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Callable[[], None]) -> None:
     @app.command()
     def replay(
         log: Recording,
@@ -52,6 +57,8 @@ def register(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Callable[
         show(report.as_dict(), as_json)
         raise typer.Exit(0 if report.mismatches == 0 and report.wire_mismatches == 0 else 1)
 
+
+def _register_recover(app: typer.Typer, show: Show, refuse: Refuse) -> None:
     @app.command()
     def recover(
         log: Recording,
@@ -71,6 +78,93 @@ def register(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Callable[
         except KeyFileError as error:
             refuse(f"{error}; {error.hint}")
         show(recover_log(log, out, ring, signer).as_dict(), as_json)
+
+
+def _register_audit(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Callable[[], None]) -> None:
+    @app.command()
+    def audit(
+        log: Recording,
+        page: Annotated[Path | None, typer.Option("--html", help="write the report as one self-contained page")] = None,
+        public_key: Annotated[
+            Path | None, typer.Option(help="whose seals are trusted, .pub; default: this machine's own")
+        ] = None,
+        sample: Annotated[
+            int, typer.Option("--replay", help="cycles to run again, beside those around stops; 0: all", min=0)
+        ] = 2000,
+        pictures: Annotated[bool, typer.Option(help="pictures of the events in the page")] = True,
+        jobs: Annotated[int, typer.Option("-j", "--jobs", help="processes; 0: one for each core", min=0)] = 1,
+        as_json: AsJson = False,
+    ) -> None:
+        """Every rule that must hold in any recording, and the report. Example: asc audit runs/latest.mcap"""
+        limit_blas()
+        from logs.audit import audit as audit_log
+        from logs.seal import KeyFileError
+
+        try:
+            trusted, name = _trusted(public_key)
+        except KeyFileError as error:
+            refuse(f"{error}; {error.hint}")
+        report, evidence = audit_log(
+            log, trusted, name, sample=sample or None, jobs=jobs or os.cpu_count() or 1, progress=_bar()
+        )
+        if page is not None:
+            _write_page(log, page, report, evidence, pictures)
+        if as_json:
+            show(report, True)
+        else:
+            for line in verdict(report):
+                print(line)
+        raise typer.Exit(0 if report["holds"] else 1)
+
+
+def _trusted(path: Path | None) -> tuple[Any, str]:
+    """The key that the auditor trusts, and its name; None without one. KeyFileError."""
+    from logs.seal import default_key_file, load_public_key
+
+    own = default_key_file().with_name(default_key_file().name + ".pub")
+    if path is None and not own.exists():
+        return None, ""
+    return load_public_key(path or own), f"the key {path}" if path else "this machine's own key"
+
+
+def _write_page(log: Path, page: Path, report: dict[str, Any], evidence: Any, pictures: bool) -> None:
+    from logs.report import html_report, moments
+
+    taken: list[Any] = []
+    note = ""
+    if evidence is not None and pictures:
+        taken, note = _pictures(log, moments(evidence))
+    page.write_text(html_report(report, evidence, taken, note), encoding="utf-8")
+
+
+def _pictures(log: Path, wanted: list[Any]) -> tuple[list[Any], str]:
+    """A picture of each moment, and why there are no more."""
+    import tempfile
+
+    from logs.report import Picture
+    from logs.view import ViewError, view
+
+    taken: list[Any] = []
+    try:
+        with tempfile.TemporaryDirectory(prefix="asc-audit-") as folder:
+            for number, moment in enumerate(wanted):
+                file = Path(folder, f"{number}.png")
+                view(log, shot=file, at=moment.t_s)
+                taken.append(Picture(moment, file.read_bytes()))
+    except ViewError as error:
+        return taken, str(error)
+    return taken, ""
+
+
+def verdict(report: dict[str, Any]) -> list[str]:
+    """A report in words."""
+    words = {True: "ok  ", False: "FAIL"}
+    lines = [
+        f"{'--  ' if rule.get('skipped') else words[rule['holds']]} {rule['name']:18} {rule['detail']}"
+        for rule in report["rules"]
+    ]
+    held = "every rule holds" if report["holds"] else "NOT IN ORDER"
+    return [*lines, f"{held}; report {report['report_sha256'][:16]}"]
 
 
 def _what_if(path: Path, overrides: list[str], as_json: bool, show: Show) -> None:

@@ -57,6 +57,11 @@ class LogFile:
         for name, data in attachments.items():
             self._writer.attachment(time.time_ns(), name, _media_type(name), data)
 
+    def attach(self, name: str, data: bytes) -> None:
+        """One more attachment, of what was not known at the beginning."""
+        now = self.wall_ns(time.monotonic_ns())
+        self._writer.attachment(now, name, _media_type(name), data)
+
     def _register(self, channel: schema.Channel) -> int:
         if channel.schema_name not in self._schemas:
             self._schemas[channel.schema_name] = self._writer.schema(

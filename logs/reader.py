@@ -48,6 +48,7 @@ class _ChunkRef:
     raw: Raw
     first: int  # number of the first cycle in it
     cycles: int
+    channels: frozenset[int]  # that have messages in it
 
 
 class Log:
@@ -126,23 +127,17 @@ class Log:
         """The messages of some topics, in the order of the file."""
         wanted = {channel: topic for channel, topic in self._topics.items() if topic in topics}
         for chunk in self._chunks:
-            content = self._content(chunk.raw)
-            for raw in mcap_scan.chunk_records(content, self._name):
-                if raw.op == Op.MESSAGE and mcap_scan.message_channel(content, raw) in wanted:
-                    found = mcap_scan.message(content, raw)
-                    t_ns = found.log_time_ns - self.wall_minus_monotonic_ns
-                    yield LogMessage(wanted[found.channel], t_ns, found.data)
+            if chunk.channels.isdisjoint(wanted):
+                continue
+            for found in mcap_scan.messages(self._content(chunk.raw), wanted):
+                t_ns = found.log_time_ns - self.wall_minus_monotonic_ns
+                yield LogMessage(wanted[found.channel], t_ns, found.data)
 
     def _uncached_content(self, raw: Raw) -> bytes:
         return mcap_scan.chunk_data(self.data, self._name, raw)
 
     def _cycle_data(self, chunk: _ChunkRef) -> list[bytes]:
-        content, channel = self._content(chunk.raw), self._cycle_channel
-        found = [
-            mcap_scan.message(content, raw).data
-            for raw in mcap_scan.chunk_records(content, self._name)
-            if raw.op == Op.MESSAGE and mcap_scan.message_channel(content, raw) == channel
-        ]
+        found = [m.data for m in mcap_scan.messages(self._content(chunk.raw), (self._cycle_channel,))]
         if any(len(data) != self.layout.size for data in found):
             raise CorruptLog(f"{self._name}: damaged at byte {chunk.raw.start}: a cycle record of the wrong size")
         return found
@@ -179,16 +174,18 @@ class Log:
 
     def _scan_chunk(self, chunk: Raw) -> None:
         content = self._content(chunk)
-        cycles = 0
+        cycles, channels = 0, set()
         for raw in mcap_scan.chunk_records(content, self._name):
-            if raw.op == Op.MESSAGE:
-                cycles += mcap_scan.message_channel(content, raw) == self._cycle_channel
+            if raw.op == mcap_scan.MESSAGE:
+                channel = mcap_scan.message_channel(content, raw)
+                channels.add(channel)
+                cycles += channel == self._cycle_channel
             elif raw.op == Op.SCHEMA:
                 found = mcap_scan.parse(Schema, content, self._name, raw)
                 self._schemas[found.id] = found
             elif raw.op == Op.CHANNEL:
                 self._meet(mcap_scan.parse(Channel, content, self._name, raw))
-        self._chunks.append(_ChunkRef(chunk, self.cycles, cycles))
+        self._chunks.append(_ChunkRef(chunk, self.cycles, cycles, frozenset(channels)))
         self.cycles += cycles
 
     def _meet(self, channel: Channel) -> None:
@@ -207,10 +204,11 @@ class Log:
             raise ForeignFile(
                 f"{self._name}: no {schema.PARAMS} in it: not a recording, or cut off before its first cycle"
             )
+        name = schema.DECIDED if schema.DECIDED in self.attachments else schema.PARAMS
         try:
-            return Params.from_canonical(self.attachments[schema.PARAMS])
+            return Params.from_canonical(self.attachments[name])
         except (ValueError, TypeError, KeyError) as error:
-            raise ForeignFile(f"{self._name}: {schema.PARAMS} is of another version: {error}") from error
+            raise ForeignFile(f"{self._name}: {name} is of another version: {error}") from error
 
 
 def open_log(path: str | Path) -> Log:

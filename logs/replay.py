@@ -16,13 +16,15 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from asc_rt.core.params import Params
 from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs
 from asc_rt.fingerprint import fingerprint
 from asc_rt.fixed_protobuf import RecordError
 from logs.diff import Difference, altered, differences
 from logs.reader import Log, open_log
-from logs.wire import replay_wire
+from logs.wire import FIELDS, Column, replay_wire
 
 Stepper = Callable[[CoreState, CycleInputs], tuple[CoreState, CycleOutputs]]
 Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm
@@ -96,20 +98,22 @@ class _Found:
 
 
 def replay(
-    path: str | Path,
+    recording: str | Path | Log,
     start: int = 0,
     order: Order = Order.FORWARD,
     *,
     stepper: Callable[[Params], Stepper] = core_stepper,
     cycles: Sequence[int] | None = None,
+    columns: dict[str, Column] | None = None,
     jobs: int = 1,
     progress: Progress = iter,
 ) -> ReplayReport:
     """Run the records from number `start` (0 = first) on again, or just `cycles`. `jobs`: processes that share it.
+    `columns`: `logs.wire.FIELDS` of all cycles, if they are at hand.
 
     LogError: the file. IndexError: fewer records than `start`.
     """
-    log = open_log(path)
+    log = recording if isinstance(recording, Log) else open_log(recording)
     if not 0 <= start < max(log.cycles, 1):
         raise IndexError(f"cycle {start}: the log has {log.cycles}")
     numbers: Sequence[int] = range(start, log.cycles) if cycles is None else cycles
@@ -121,8 +125,9 @@ def replay(
     if jobs == 1:
         found = _replay_part(log, stepper(log.params), progress(numbers), tolerance)
     else:
-        _replay_shared(found, path, stepper, numbers, tolerance, jobs, progress)
-    gaps, wire = _gaps(log), replay_wire(log)
+        _replay_shared(found, log.path, stepper, numbers, tolerance, jobs, progress)
+    columns = columns or log.columns(*FIELDS)
+    gaps, wire = int((np.diff(columns["inputs.tick"]) != 1).sum()), replay_wire(log, columns, cycles)
     return ReplayReport(
         found.count, found.mismatches, found.exact, match, found.first, wire.mismatches, wire.first, wire.decoded, gaps,
         tolerance, found.largest, log.truncated,
@@ -217,8 +222,3 @@ def _of_next(found: Difference) -> Difference:
 def _tick(log: Log, index: int) -> int:
     offset = log.layout.dtype.fields["inputs.tick"][1]  # type: ignore[index]
     return int.from_bytes(log.record(index)[offset : offset + 8], "little", signed=True)
-
-
-def _gaps(log: Log) -> int:
-    ticks = log.columns("inputs.tick")["inputs.tick"]
-    return int((ticks[1:] != ticks[:-1] + 1).sum())

@@ -13,6 +13,7 @@ PROFILE = "asc"  # of the MCAP header
 LIBRARY = "asc-rt logs.writer"
 
 PARAMS, CELL, FINGERPRINT = "params.json", "cell.toml", "fingerprint.json"  # names of attachments
+DECIDED = "params.decided.json"  # the parameters after the robot told its own limits, where they differ
 PACKAGES, CLOCK, CERTIFICATE = "packages.txt", "clock.json", "certificate"
 SESSION, END, RECOVERED = "session", "end", "recovered"  # names of metadata records
 

@@ -209,6 +209,7 @@ def sign_file(path: Path, key: Ed25519PrivateKey, session: str, size: int, sha25
 
 def check_file(path: Path, public_hex: str) -> bool | None:
     """Does `FILE.sig` hold for the whole file and this key? None: there is none. LogError: it cannot be read."""
+    path = path.resolve()  # a link such as latest.mcap has no signature of its own
     try:
         found = json.loads(signature_path(path).read_text())
         with open(path, "rb") as file:

@@ -53,6 +53,11 @@ class SessionFiles:
     def json(self, channel: schema.Channel, t_ns: int, value: Mapping[str, Any]) -> None:
         self.log.json(channel, t_ns, value)
 
+    def attach(self, name: str, data: bytes) -> None:
+        """An attachment of this file and of those to come."""
+        self._attachments = {**self._attachments, name: data}
+        self.log.attach(name, data)
+
     def flush(self) -> None:
         """Make all messages durable; begin the next file if this one is long enough."""
         self.log.flush()

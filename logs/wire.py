@@ -6,7 +6,9 @@ A driver without `drivers.base.ReplayCodec` can be checked for the presence of i
 
 from __future__ import annotations
 
+import functools
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +19,11 @@ from drivers.base import DriverError, ReplayCodec
 from logs import schema
 from logs.reader import Log
 
+Column = np.ndarray[Any, Any]
+
 TOLERANCE = 1e-6  # rad: float32 degrees of the wire are up to 2.7e-7 rad off
 
-_FIELDS = (
+FIELDS = (
     "inputs.tick", "inputs.joint.present", "inputs.joint.t_rx_ns", "inputs.joint.seq", "inputs.joint.q",
     "inputs.joint.current", "receipt.present", "receipt.ok", "receipt.t_tx_ns", "receipt.seq", "receipt.q",
     "outputs.command.q", "outputs.command.is_last",
@@ -34,22 +38,40 @@ class WireReport:
     first: str  # the first of them, in words
 
 
-def replay_wire(log: Log) -> WireReport:
-    """LogError: the file."""
-    received, sent = (_packets(log, channel) for channel in (schema.WIRE_RX, schema.WIRE_TX))
+def replay_wire(log: Log, columns: dict[str, Column] | None = None, decode: Sequence[int] | None = None) -> WireReport:
+    """`columns`: FIELDS of all cycles, if they are at hand. `decode`: cycles that go through the codec; None: all.
+
+    LogError: the file.
+    """
+    c = columns or log.columns(*FIELDS)
+    received, sent = packets(log)
     codec = codec_of(log)
     if not received and not sent:
         return WireReport(0, codec is not None, 0, "")
-    mismatches, first = 0, ""
-    for batch in log.batches():
-        columns = {name: batch[name] for name in _FIELDS}
-        for i in range(len(batch)):
-            row = {name: column[i] for name, column in columns.items()}
-            wrong = _heard(row, received, codec) or _said(row, sent, codec)
-            mismatches += bool(wrong)
-            if wrong and not first:
-                first = f"cycle {int(row['inputs.tick'])}: {wrong}"
-    return WireReport(len(received) + len(sent), codec is not None, mismatches, first)
+    heard = c["inputs.joint.present"] == 1
+    claimed = (c["receipt.present"] == 1) & (c["receipt.ok"] == 1)
+    off = np.abs(c["receipt.q"] - c["outputs.command.q"]).max(axis=1, initial=0.0)
+    checks = {
+        "no packet was received at the time of its sample": heard & ~_among(c["inputs.joint.t_rx_ns"], received),
+        "no packet was sent at the time of its command": claimed & ~_among(c["receipt.t_tx_ns"], sent),
+        "something else was sent than decided": claimed & ~(off <= TOLERANCE),
+    }
+    wrong = {int(i): words for words, bad in checks.items() for i in np.flatnonzero(bad)}
+    if codec is not None:
+        for i in range(len(heard)) if decode is None else decode:
+            if i in wrong:
+                continue
+            words = _heard(c, i, received, codec) if heard[i] else ""
+            if words := words or (_said(c, i, sent, codec) if claimed[i] else ""):
+                wrong[i] = words
+    first = min(wrong, default=None)
+    told = "" if first is None else f"cycle {int(c['inputs.tick'][first])}: {wrong[first]}"
+    return WireReport(len(received) + len(sent), codec is not None, len(wrong), told)
+
+
+def _among(times: Column, packets: dict[int, bytes]) -> Column:
+    found: Column = np.isin(times, np.fromiter(packets, np.int64, len(packets)))
+    return found
 
 
 def codec_of(log: Log) -> ReplayCodec | None:
@@ -62,43 +84,31 @@ def codec_of(log: Log) -> ReplayCodec | None:
     return driver if isinstance(driver, ReplayCodec) else None
 
 
-def _packets(log: Log, channel: schema.Channel) -> dict[int, bytes]:
-    """Time -> bytes."""
-    found = (schema.parse_wire_message(message.data) for message in log.messages(channel.topic))
-    return {t_ns: data for t_ns, _, data in found}
+@functools.lru_cache(1)
+def packets(log: Log) -> tuple[dict[int, bytes], dict[int, bytes]]:
+    """Received and sent: time -> bytes."""
+    found: dict[str, dict[int, bytes]] = {schema.WIRE_RX.topic: {}, schema.WIRE_TX.topic: {}}
+    for message in log.messages(*found):
+        t_ns, _, data = schema.parse_wire_message(message.data)
+        found[message.topic][t_ns] = data
+    return found[schema.WIRE_RX.topic], found[schema.WIRE_TX.topic]
 
 
-def _heard(row: dict[str, Any], received: dict[int, bytes], codec: ReplayCodec | None) -> str:
-    """What is wrong with the sample; "": nothing."""
-    if not row["inputs.joint.present"]:
-        return ""
-    data = received.get(int(row["inputs.joint.t_rx_ns"]))
-    if data is None:
-        return "no packet was received at the time of its sample"
-    if codec is None:
-        return ""
+def _heard(c: dict[str, Column], i: int, received: dict[int, bytes], codec: ReplayCodec) -> str:
+    """What is wrong with the sample of cycle i; "": nothing."""
     try:
-        told = codec.decode_sample(data)
+        told = codec.decode_sample(received[int(c["inputs.joint.t_rx_ns"][i])])
     except DriverError as error:
         return f"its sample does not decode: {error}"
     if told is None:
         return "the packet of its sample is of another kind"
     seq, q, current = told
-    same = seq == row["inputs.joint.seq"] and np.array_equal(q, row["inputs.joint.q"])
-    return "" if same and np.array_equal(current, row["inputs.joint.current"]) else "its sample decodes otherwise"
+    same = seq == c["inputs.joint.seq"][i] and np.array_equal(q, c["inputs.joint.q"][i])
+    return "" if same and np.array_equal(current, c["inputs.joint.current"][i]) else "its sample decodes otherwise"
 
 
-def _said(row: dict[str, Any], sent: dict[int, bytes], codec: ReplayCodec | None) -> str:
-    """What is wrong with the command; "": nothing, or nothing claims to have been sent."""
-    if not (row["receipt.present"] and row["receipt.ok"]):
-        return ""
-    data = sent.get(int(row["receipt.t_tx_ns"]))
-    if data is None:
-        return "no packet was sent at the time of its command"
-    if not abs(row["receipt.q"] - row["outputs.command.q"]).max() <= TOLERANCE:
-        return "something else was sent than decided"
-    if codec is None:
-        return ""
-    last = bool(row["outputs.command.is_last"])
-    again = codec.encode_set_point(int(row["receipt.seq"]), row["outputs.command.q"], last)
-    return "" if again == data else "its command encodes to other bytes than were sent"
+def _said(c: dict[str, Column], i: int, sent: dict[int, bytes], codec: ReplayCodec) -> str:
+    """What is wrong with the command of cycle i; "": nothing."""
+    last = bool(c["outputs.command.is_last"][i])
+    again = codec.encode_set_point(int(c["receipt.seq"][i]), c["outputs.command.q"][i], last)
+    return "" if again == sent[int(c["receipt.t_tx_ns"][i])] else "its command encodes to other bytes than were sent"

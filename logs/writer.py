@@ -9,6 +9,7 @@ the ring and closes the file. Ctrl-C is left to the supervisor: the cycles of th
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import signal
@@ -167,6 +168,16 @@ class Logger:
                     break
                 if self.failure is None:
                     self._log.message(channel, self._clock(), data)
+                    if channel is schema.CONTROL:
+                        self._keep_decided(data)
+
+    def _keep_decided(self, data: bytes) -> None:
+        """The control process tells what it really decides with, the robot's own limits included: replay needs that."""
+        try:
+            decided = json.loads(data)["params"].encode()
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return  # another event, or not ours: the topic is open to anybody on the bus
+        self._log.attach(schema.DECIDED, decided)
 
     def _count_losses(self) -> None:
         lost = {"cycle": self._cycles.lost, "wire": self._wire.lost if self._wire else 0}

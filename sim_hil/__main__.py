@@ -1,10 +1,10 @@
-"""`python -m sim_hil DEVICE CELL ...`: one simulated device as a process of its own."""
+"""`python -m sim_hil DEVICE CELL ...`: one simulated device, or a suite of trials, as a process of its own."""
 
 from __future__ import annotations
 
 import sys
 
-USAGE = "usage: python -m sim_hil {fanuc | human} CELL [options]"
+USAGE = "usage: python -m sim_hil {fanuc CELL | human CELL | trials SUITE} [options]"
 
 
 def main(argv: list[str]) -> int:
@@ -17,6 +17,10 @@ def main(argv: list[str]) -> int:
             from sim_hil import human
 
             return human.main(cell, rest)
+        case ["trials", *rest]:
+            from sim_hil.trials import main as trials
+
+            return trials.main(rest)
     print(USAGE, file=sys.stderr)
     return 2
 

@@ -7,8 +7,9 @@ n, C, H and the nearest points do not depend on dq, and drift and h are quadrati
     d h_i  / d dq_j  = sum_k 2 m_k Jv_ki . Jvdot_kj + z_i . (I_k dalpha_kj + z_j x I_k omega_k + omega_k x I_k z_j)
 
 (linear acceleration is integrable: sum_i d2p/dq_i dq_j dq_i counts twice; dalpha_kj = omega_{j-1} x z_j + z_j x
-(omega_k - omega_j)). By the envelope theorem the maximum over U moves with its active bounds only: - y . dh for the
-torque rows.
+(omega_k - omega_j)). By the envelope theorem the maximum over U moves with its active bounds only (multipliers y):
+
+    d max / d dq = - y_rows . dh / d dq + y_box d bound / d dq        d bound / d dq = -J / A in a braking zone, else 0
 """
 
 from __future__ import annotations
@@ -19,12 +20,19 @@ from numba import njit
 from asc_rt.core.abstraction import MIN_AXIS_DISTANCE, People, _nearest
 from asc_rt.core.dynamics import Inertias, _apply, _world_inertia
 from asc_rt.core.kinematics import Motion, Three, cross
+from asc_rt.core.limits import Bounds
+from asc_rt.core.robot_model import Arm
 from asc_rt.core.types import Vector
 
 
 @njit(cache=True, inline="always")
 def _dot(a: Three, b: Three) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, inline="always")
+def _sum(a: Three, b: Three) -> tuple[float, float, float]:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @njit(cache=True)
@@ -86,29 +94,66 @@ def drift_gradient(motion: Motion, joint: int, r0: Vector, r1: Vector, people: P
 
 @njit(cache=True)
 def bias_gradient(motion: Motion, bodies: Inertias, y: Vector) -> Vector:
-    """d (y . h) / d dq, (n,) for multipliers y, (n,)."""
+    """d (y . h) / d dq, (n,) for multipliers y, (n,).
+
+    In time proportional to n: y is taken through the chain as a joint speed, which gives every body a velocity u of its
+    com and an angular velocity a; what a joint j contributes to the bodies k >= j is then a sum over them:
+
+        d (y . h) / d dq_j = (w_j x z_j) . sum_k (2 m (c_k - o_j) x u + 2 I a)
+                           + z_j . sum_k (2 m (v_k - v_j) x u + w_k x I a + I w_k x a + I (a x w_k))
+    """
     n = y.shape[0]
-    out = np.zeros(n)
-    half, world = np.empty((3, 3)), np.empty((3, 3))
-    J, J_dot = np.empty((n, 3)), np.empty((n, 3))
+    out, half, world = np.zeros(n), np.empty((3, 3)), np.empty((3, 3))
+    u, a = np.empty((n, 3)), np.empty((n, 3))
+    turn, shift = np.zeros(3), np.zeros(3)
     for k in range(n):
-        omega = motion.omega[k]
-        lever = np.array(_apply(motion.rotation[k], bodies.com[k]))
-        com = motion.origin[k] + lever
-        velocity = motion.velocity[k] + np.array(cross(omega, lever))
-        _column_rates(motion, k, com, velocity, J, J_dot)
+        lever, moment = _apply(motion.rotation[k], bodies.com[k]), cross(motion.axis[k], motion.origin[k])
+        for x in range(3):
+            turn[x] += y[k] * motion.axis[k, x]
+            shift[x] += y[k] * moment[x]
+        velocity = cross(turn, _sum(motion.origin[k], lever))
+        for x in range(3):
+            a[k, x], u[k, x] = turn[x], velocity[x] - shift[x]
+    first, push, second = np.zeros(3), np.zeros(3), np.zeros(3)
+    for k in range(n - 1, -1, -1):
+        omega, m2 = motion.omega[k], 2.0 * bodies.mass[k]
         _world_inertia(motion.rotation[k], bodies.inertia[k], half, world)
-        spin = np.array(_apply(world, omega))
-        linear, angular = np.zeros(3), np.zeros(3)
-        for i in range(k + 1):
-            for a in range(3):
-                linear[a] += y[i] * J[i, a]
-                angular[a] += y[i] * motion.axis[i, a]
-        for j in range(k + 1):
-            z = motion.axis[j]
-            turned, relative = cross(motion.omega[j], z), cross(z, omega - motion.omega[j])
-            alpha = np.array((turned[0] + relative[0], turned[1] + relative[1], turned[2] + relative[2]))
-            gyro_a, gyro_b = cross(z, spin), cross(omega, _apply(world, z))
-            out[j] += 2.0 * bodies.mass[k] * _dot(linear, J_dot[j])
-            out[j] += _dot(angular, _apply(world, alpha)) + _dot(angular, gyro_a) + _dot(angular, gyro_b)
+        lever = _apply(motion.rotation[k], bodies.com[k])
+        turned = _apply(world, a[k])
+        about_com, by_speed = (
+            cross(_sum(motion.origin[k], lever), u[k]),
+            cross(_sum(motion.velocity[k], cross(omega, lever)), u[k]),
+        )
+        gyro_a, gyro_b = cross(omega, turned), cross(_apply(world, omega), a[k])
+        gyro_c = _apply(world, cross(a[k], omega))
+        for x in range(3):
+            push[x] += m2 * u[k, x]
+            first[x] += m2 * about_com[x] + 2.0 * turned[x]
+            second[x] += m2 * by_speed[x] + gyro_a[x] + gyro_b[x] + gyro_c[x]
+        swing = cross(omega, motion.axis[k])
+        at_origin, at_speed = cross(motion.origin[k], push), cross(motion.velocity[k], push)
+        for x in range(3):
+            out[k] += swing[x] * (first[x] - at_origin[x]) + motion.axis[k, x] * (second[x] - at_speed[x])
+    return out
+
+
+@njit(cache=True)
+def box_gradient(bounds: Bounds, lower: Vector, upper: Vector, y: Vector) -> Vector:
+    """d (y . active bound) / d dq of `limits.acceleration_box`, (n,): each bound depends on its own joint's speed."""
+    out = np.zeros(lower.shape[0])
+    for i in range(out.shape[0]):
+        A = bounds.ddq_max[i]
+        bound = upper[i] if y[i] > 0.0 else lower[i]
+        if -A < bound < A:
+            out[i] = -y[i] * bounds.dddq_max[i] / A
+    return out
+
+
+@njit(cache=True)
+def support_gradient(arm: Arm, motion: Motion, lower: Vector, upper: Vector, y: Vector) -> Vector:
+    """d (max over U of c . u) / d dq at fixed c, (n,), by its multipliers y = (box, torque rows)."""
+    n = lower.shape[0]
+    out = box_gradient(arm.bounds, lower, upper, y[:n])
+    if y.shape[0] > n:
+        out -= bias_gradient(motion, arm.bodies, y[n:])
     return out

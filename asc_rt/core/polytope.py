@@ -19,6 +19,7 @@ from asc_rt.core.types import IntVector, Matrix, Vector
 BoolVector = npt.NDArray[np.bool_]
 
 TOLERANCE = 1e-9  # relative to the bounds: a row violated by less is kept
+NUDGE = 1e-11  # of the size of c: the value may be less by about this share of the size of U
 MAX_PIVOTS = 200  # far above the 2n or so that occur; a cycling program ends as "empty", which stops the robot
 
 
@@ -99,14 +100,22 @@ def support(c: Vector, U: Polytope) -> Support:
 
     Starts at the vertex of the box that c points to, which is dual feasible, and brings the worst violated row into
     the basis until none is violated. With no rows G it is the closed form sum_i max(c_i lower_i, c_i upper_i).
+
+    A joint that c does not need (those beyond the link of the pair) has the multiplier 0, and with several of these the
+    method can run in circles. So it steps by a c that is a little larger everywhere, each entry by another share, and
+    takes the multipliers of the true c in the end.
     """
     n = c.shape[0]
     multipliers = np.zeros(n + U.G.shape[0])
-    u, y = np.empty(n), c.copy()  # vertex; multipliers of the n active constraints
+    u, y = np.empty(n), np.empty(n)  # vertex; multipliers of the n active constraints
     active = np.arange(n)  # the active constraints: < n box, >= n row of G
     at_upper = c > 0.0
     inverse = np.eye(n)  # of the matrix whose rows are the active constraints' normals
     w = np.empty(n)
+    most = 1.0 + np.abs(c).max()
+    for i in range(n):
+        share = NUDGE * most * (1.0 + (0.6180339887 * i) % 1.0)
+        y[i] = c[i] + share if at_upper[i] else c[i] - share
     _vertex(active, at_upper, inverse, U, u)
     for _ in range(MAX_PIVOTS):
         entering, to_upper = _worst_row(u, U)
@@ -114,7 +123,8 @@ def support(c: Vector, U: Polytope) -> Support:
             value = 0.0
             for k in range(n):
                 value += c[k] * u[k]
-                multipliers[active[k]] = y[k]
+                for i in range(n):
+                    multipliers[active[k]] += c[i] * inverse[i, k]
             return Support(value, u, multipliers)
         side = 1.0 if to_upper else -1.0
         leaving, least = -1, np.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Callable
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from asc_rt.config import load_cell
+from asc_rt.config import Cell, load_cell
 from asc_rt.core.params import Params
+from asc_rt.core.step import step
+from asc_rt.core.system import System, initial
 from asc_rt.core.types import (
     CommandKind,
     CoreState,
@@ -33,15 +36,19 @@ from asc_rt.core.types import (
     SafetyDecision,
     Status,
     StopReason,
+    Vector,
     vector,
 )
 from asc_rt.record import RecordLayout, Timings
-from drivers.base import WriteReceipt
+from drivers.base import ReplayCodec, WriteReceipt
+from drivers.registry import driver_class
 from logs import schema
 from logs.context import attachments, session
 from logs.log_file import LogFile
+from sim_hil.fanuc import wire as peer
 
 PERIOD_NS = 8_000_000
+KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 T0_NS = 5_000_000_000
 Cycle = tuple[CoreState, CycleInputs, CycleOutputs, WriteReceipt | None, Timings]
 
@@ -108,11 +115,26 @@ def run_session(n: int, count: int, end: bool = True) -> list[Cycle]:
     return cycles
 
 
+@functools.cache
+def _cell() -> Cell:
+    return load_cell("fanuc-sim")
+
+
+@functools.cache
+def _attachments() -> dict[str, bytes]:
+    return attachments(_cell())
+
+
+@functools.cache
+def _session() -> dict[str, str]:
+    return session(_cell())
+
+
 class Recording:
     """Writes sessions to MCAP files the way the logger does."""
 
     def __init__(self, folder: Path) -> None:
-        self.cell = load_cell("fanuc-sim")
+        self.cell = _cell()
         self.params: Params = self.cell.params
         self.layout = RecordLayout(self.params.n)
         self._names = (folder / f"log{i}.mcap" for i in itertools.count())
@@ -140,11 +162,11 @@ class Recording:
         key: Ed25519PrivateKey | None = None,
     ) -> Path:
         path = next(self._names)
-        files = attachments(self.cell)
+        files = dict(_attachments())
         if fingerprint is not None:
             files[schema.FINGERPRINT] = json.dumps(fingerprint).encode()
         # These packets are no robot's: a driver without a codec to check them with.
-        about = {**session(self.cell), "driver": json.dumps({"name": "loopback"})}
+        about = {**_session(), "driver": json.dumps({"name": "loopback"})}
         log = LogFile(path, files, about, key=key)
         for k, record in enumerate(records):
             row = np.frombuffer(record, self.layout.dtype)[0]
@@ -174,3 +196,83 @@ def recording(tmp_path: Path) -> Recording:
 def decision() -> Callable[[Params], Any]:
     """The stepper that made the recordings."""
     return lambda _: decide
+
+
+# --- the real decision -----------------------------------------------------------------------------------------------
+
+
+def approaching(t_ns: int, seq: int) -> HumanState:
+    """An arm at 0.9 m that comes 2 mm closer every cycle."""
+    p0 = vector([[0.9 - 0.002 * seq, 0.1, 0.2], [0.9 - 0.002 * seq, 0.2, 0.5]])
+    v = vector(np.tile([-0.25, 0.0, 0.0], (2, 1)))
+    bounds = vector([0.08] * 2), vector([0.02] * 2), vector([0.3] * 2)
+    return HumanState(t_ns - 30_000_000, seq, 1, 0, Health.OK, 1.0, True, p0, p0, v, v, *bounds, np.zeros(2, np.int64))
+
+
+@pytest.fixture
+def core_session(recording: Recording) -> tuple[Path, list[Any]]:
+    """The arm follows its set-points exactly and works towards a goal."""
+    system = System(recording.params)
+    state, goal = initial(system), Goal(1, vector([1.0, 0.3, 0.2, 0.0, -1.2, 0.0]))
+    q: Vector = vector([0.0, 0.3, 0.2, 0.0, -1.2, 0.0])
+    cycles = []
+    for plain in (cycle[1] for cycle in recording.cycles(150)):
+        k = plain.tick
+        joint = dataclasses.replace(
+            plain.joint, q=state.q_cmd if k else q, dq=state.dq_cmd, flags=RobotFlag.READY | RobotFlag.SERVO_ON
+        )
+        events = (OperatorEvent(1, EventKind.ARM),) if k == 3 else ()
+        x = dataclasses.replace(
+            plain, joint=joint, human=approaching(plain.t_ns, k + 1), goal=goal, events=events, late=False
+        )
+        before = state
+        state, out = step(system, before, x)
+        assert out.command is not None
+        cycles.append(
+            (before, x, out, WriteReceipt(x.t_ns + 1_000_000, k, out.command.q, True), Timings(*[x.t_ns] * 4))
+        )
+    return recording.write(recording.packed(cycles), key=KEY), cycles
+
+
+# --- true packets ----------------------------------------------------------------------------------------------------
+
+Packets = list[tuple[schema.Channel, int, bytes]]
+
+
+def status(seq: int, joints: Any, current: Any) -> bytes:
+    return peer.write_reply("status", 3, sequence=seq, status=0x0F, joints=joints, current=current)
+
+
+def codec() -> ReplayCodec:
+    made = driver_class("fanuc-j519")({"host": "127.0.0.1", "version": 3})
+    assert isinstance(made, ReplayCodec)
+    return made
+
+
+@pytest.fixture
+def wire_session(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
+    """A session whose packets are true, and `spoil` to change them or the cycles."""
+
+    def build(spoil: Callable[[Packets], None] = lambda packets: None, cell: Any = None) -> Path:
+        packets: Packets = []
+        cycles = []
+        for state, x, out, receipt, timings in recording.cycles(12):
+            joints = np.float32(np.linspace(-20, 30, 9) + x.tick)
+            data = status(x.tick, joints, joints / 10)
+            told = codec().decode_sample(data)
+            assert told is not None
+            joint = dataclasses.replace(x.joint, seq=told[0], q=told[1], current=told[2])
+            packets.append((schema.WIRE_RX, joint.t_rx_ns, data))
+            sent = codec().encode_set_point(receipt.seq, out.command.q, out.command.is_last)
+            packets.append((schema.WIRE_TX, receipt.t_tx_ns, sent))
+            cycles.append((state, dataclasses.replace(x, joint=joint), out, receipt, timings))
+        spoil(packets)
+        log = LogFile(tmp_path / "a.mcap", attachments(recording.cell), session(cell or recording.cell))
+        for cycle, record in zip(cycles, recording.packed(cycles), strict=True):
+            log.message(schema.CYCLE, cycle[1].t_ns, record)
+        for channel, t_ns, data in packets:
+            log.message(channel, t_ns, schema.wire_message(t_ns, len(data), data))
+        log.close({})
+        return tmp_path / "a.mcap"
+
+    return build

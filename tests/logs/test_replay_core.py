@@ -5,70 +5,22 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-
 from asc_rt.core.params import Params
-from asc_rt.core.step import step
-from asc_rt.core.system import System, initial
 from asc_rt.core.types import (
     CoreState,
     CycleInputs,
     CycleOutputs,
-    EventKind,
-    Goal,
-    Health,
-    HumanState,
     Mode,
-    OperatorEvent,
-    RobotFlag,
     Status,
-    Vector,
-    vector,
 )
-from asc_rt.record import Timings
-from drivers.base import WriteReceipt
 from logs.commands import told
 from logs.reader import open_log
 from logs.replay import Order, core_stepper, replay
 from logs.whatif import _stop_changes, what_if
 
 
-def approaching(t_ns: int, seq: int) -> HumanState:
-    """An arm at 0.9 m that comes 2 mm closer every cycle."""
-    p0 = vector([[0.9 - 0.002 * seq, 0.1, 0.2], [0.9 - 0.002 * seq, 0.2, 0.5]])
-    v = vector(np.tile([-0.25, 0.0, 0.0], (2, 1)))
-    bounds = vector([0.08] * 2), vector([0.02] * 2), vector([0.3] * 2)
-    return HumanState(t_ns - 30_000_000, seq, 1, 0, Health.OK, 1.0, True, p0, p0, v, v, *bounds, np.zeros(2, np.int64))
-
-
-@pytest.fixture
-def session(recording: Any) -> tuple[Path, list[Any]]:
-    """The arm follows its set-points exactly and works towards a goal."""
-    system = System(recording.params)
-    state, goal = initial(system), Goal(1, vector([1.0, 0.3, 0.2, 0.0, -1.2, 0.0]))
-    q: Vector = vector([0.0, 0.3, 0.2, 0.0, -1.2, 0.0])
-    cycles = []
-    for plain in (cycle[1] for cycle in recording.cycles(150)):
-        k = plain.tick
-        joint = dataclasses.replace(
-            plain.joint, q=state.q_cmd if k else q, dq=state.dq_cmd, flags=RobotFlag.READY | RobotFlag.SERVO_ON
-        )
-        events = (OperatorEvent(1, EventKind.ARM),) if k == 3 else ()
-        x = dataclasses.replace(
-            plain, joint=joint, human=approaching(plain.t_ns, k + 1), goal=goal, events=events, late=False
-        )
-        before = state
-        state, out = step(system, before, x)
-        assert out.command is not None
-        cycles.append(
-            (before, x, out, WriteReceipt(x.t_ns + 1_000_000, k, out.command.q, True), Timings(*[x.t_ns] * 4))
-        )
-    return recording.write(recording.packed(cycles)), cycles
-
-
-def test_the_core_replays_to_the_bit(session: tuple[Path, list[Any]]) -> None:
-    path, cycles = session
+def test_the_core_replays_to_the_bit(core_session: tuple[Path, list[Any]]) -> None:
+    path, cycles = core_session
     assert cycles[-1][0].mode is Mode.ACTIVE
     assert {Status.PASS, Status.FILTERED} <= {out.decision.status for _, _, out, _, _ in cycles}
     for start, order in ((0, Order.FORWARD), (60, Order.FORWARD), (0, Order.REVERSE)):
@@ -76,24 +28,24 @@ def test_the_core_replays_to_the_bit(session: tuple[Path, list[Any]]) -> None:
         assert (report.cycles, report.mismatches, report.exact) == (150 - start, 0, True)
 
 
-def test_several_processes_give_the_same_verdict(session: tuple[Path, list[Any]]) -> None:
-    assert replay(session[0], jobs=2).as_dict() == replay(session[0]).as_dict()
+def test_several_processes_give_the_same_verdict(core_session: tuple[Path, list[Any]]) -> None:
+    assert replay(core_session[0], jobs=2).as_dict() == replay(core_session[0]).as_dict()
 
 
 def with_d_min(params: Params, d_min: float) -> Params:
     return dataclasses.replace(params, safety=dataclasses.replace(params.safety, d_min=d_min))
 
 
-def test_what_if_nothing_changes_then_nothing_differs(session: tuple[Path, list[Any]]) -> None:
-    log = open_log(session[0])
+def test_what_if_nothing_changes_then_nothing_differs(core_session: tuple[Path, list[Any]]) -> None:
+    log = open_log(core_session[0])
     found = what_if(log, core_stepper(log.params), log.params)
     assert (found.cycles, found.differing, found.first, found.ended) == (150, 0, None, "")
     assert found.waveforms == {}
     assert told({**found.as_dict()}) == ["150 cycles, nothing differs"]
 
 
-def test_what_if_the_distance_were_another(session: tuple[Path, list[Any]]) -> None:
-    log = open_log(session[0])
+def test_what_if_the_distance_were_another(core_session: tuple[Path, list[Any]]) -> None:
+    log = open_log(core_session[0])
     params = with_d_min(log.params, 0.2)
     found = what_if(log, core_stepper(params), params)
     assert found.first is not None
@@ -105,9 +57,9 @@ def test_what_if_the_distance_were_another(session: tuple[Path, list[Any]]) -> N
     assert told(found.as_dict())[1].startswith("first: cycle ")
 
 
-def test_what_if_goes_on_from_its_own_state(session: tuple[Path, list[Any]]) -> None:
+def test_what_if_goes_on_from_its_own_state(core_session: tuple[Path, list[Any]]) -> None:
     """A change of one cycle reaches the later ones, which a replay must not show."""
-    log = open_log(session[0])
+    log = open_log(core_session[0])
     decide = core_stepper(log.params)
 
     def nudged(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
@@ -118,8 +70,8 @@ def test_what_if_goes_on_from_its_own_state(session: tuple[Path, list[Any]]) -> 
     assert found.fields["state.event_id"].cycles == 150 - 41
 
 
-def test_code_that_raises_ends_the_what_if_and_says_where(session: tuple[Path, list[Any]]) -> None:
-    log = open_log(session[0])
+def test_code_that_raises_ends_the_what_if_and_says_where(core_session: tuple[Path, list[Any]]) -> None:
+    log = open_log(core_session[0])
     decide = core_stepper(log.params)
 
     def broken(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:

@@ -1,0 +1,394 @@
+"""The rules of the audit: what must hold in any recording. One function each; the table `RULES` is their order.
+
+A rule judges by the record alone and by formulas of its own: it does not ask the code that it judges (but for the
+geometry of capsules, in `separation`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from asc_rt.core.rows import nearest_measured
+from asc_rt.core.system import System
+from asc_rt.core.types import CommandKind, EventKind, Health, Mode, Status, StopReason, vector
+from logs import audit_wire, schema, seal
+from logs.audit_evidence import Column, Evidence
+from logs.summary import APPROACH_M_S, dropped, stops
+from logs.wire import packets
+
+ROUNDING = 1e-5  # share of a limit that rounding may take: the gate allows as much
+REST_STEP = 1e-9  # rad in one cycle: a set-point that stands still
+MARGIN = 1e-5  # m/s2: what the solver may leave of a row
+STANDING = 1e-3  # rad/s: below it the arm counts as at rest, as seen by a person beside it. ASSUMED
+STOP_SLACK_S = 0.05  # ASSUMED: what a stop may take longer than its own ramp
+SPACING = 2.0  # periods: a longer pause that nobody declared is a fault
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    name: str
+    holds: bool
+    detail: str
+    skipped: bool = False  # it could not be judged; `detail` says why
+    worst: float | None = None  # the value nearest to, or farthest beyond, the limit
+    limit: float | None = None
+    unit: str = ""
+    moment: str = ""  # of the worst
+
+
+Rule = Callable[[Evidence], Finding]
+
+
+def _skip(name: str, why: str) -> Finding:
+    return Finding(name, True, f"not judged: {why}", skipped=True)
+
+
+# --- who and whole ---------------------------------------------------------------------------------------------------
+
+
+def identity(e: Evidence) -> Finding:
+    """The attachments that the session began with are there, unaltered."""
+    told, files = e.log.session, e.log.attachments
+    promised = {key.removeprefix("sha256 "): value for key, value in told.items() if key.startswith("sha256 ")}
+    wrong = [name for name, value in promised.items() if hashlib.sha256(files.get(name, b"")).hexdigest() != value]
+    who = ", ".join(f"{key} {told.get(key, 'unknown')}" for key in ("cell", "git_commit", "operator", "started"))
+    later = f", later {', '.join(sorted(files.keys() - promised))}" if files.keys() - promised else ""
+    detail = f"{who}, {len(files)} attachments{later}"
+    return Finding("identity", not wrong, f"altered or missing: {', '.join(wrong)}" if wrong else detail)
+
+
+def seals(e: Evidence) -> Finding:
+    """Seals hold (the reader has checked each), reach to the end, and are of a key that the auditor trusts."""
+    s, name = e.log.seals, "seals"
+    if not s.public_key:
+        return Finding(name, False, "the session was not sealed: nothing shows that it is unaltered")
+    if not s.count:
+        return Finding(name, False, "the session should be sealed, and has no seal")
+    whole, key = e.log.extent.data_bytes, seal.key_id(s.public_key)
+    detail = f"{s.count} seals hold, to byte {s.sealed_bytes} of {whole}, key {key}"
+    if e.trusted is None:
+        return Finding(name, True, f"{detail}; whose key it is was not said (--public-key)")
+    if seal.raw_hex(e.trusted) != s.public_key:
+        return Finding(name, False, f"signed with {key}, which is not {e.trusted_name} (--public-key)")
+    rest = "" if s.final else f"; the last {whole - s.sealed_bytes} bytes are not sealed"
+    return Finding(name, True, f"{detail}, as {e.trusted_name}{rest}")
+
+
+def signature(e: Evidence) -> Finding:
+    """The detached signature, if there is one, is of this file as it is."""
+    holds = seal.check_file(e.log.path, e.log.seals.public_key) if e.log.seals.public_key else None
+    if holds is None:
+        return _skip("signature", f"there is no {seal.signature_path(e.log.path).name}")
+    return Finding("signature", holds, "over every byte" if holds else "does not belong to this file")
+
+
+def closed(e: Evidence) -> Finding:
+    """The file was closed by the logger, or afterwards by `asc recover`."""
+    if e.log.truncated:
+        left = len(e.log.data) - e.log.extent.complete_bytes
+        return Finding("closed", False, f"not closed, {left} bytes behind the last whole record; run asc recover")
+    if e.log.recovered:
+        told = e.log.recovered
+        added = f", {told['cycles_from_ring']} cycles from the ring" if told["cycles_from_ring"] != "0" else ""
+        return Finding("closed", True, f"recovered, {told['bytes_cut']} bytes cut{added}")
+    return Finding("closed", True, f"by the logger: {e.log.end.get('reason', 'unknown')}")
+
+
+def records(e: Evidence) -> Finding:
+    """Every cycle record's own checksum is right."""
+    detail = "every record's checksum is right" if not e.broken_records else f"{e.broken_records} records were altered"
+    return Finding("records", e.broken_records == 0, detail)
+
+
+def completeness(e: Evidence) -> Finding:
+    """Ticks increase by one from the first cycle to the last, and nothing was dropped."""
+    step = np.diff(e.c["inputs.tick"])
+    gaps, twice = np.flatnonzero(step > 1), np.flatnonzero(step < 1)
+    lost = dropped(e.log, e.c["inputs.tick"])
+    e.notes["gaps"] = [[int(e.c["inputs.tick"][i]), int(step[i]) - 1] for i in gaps[:100]]
+    if not len(gaps) and not len(twice) and not lost:
+        return Finding("completeness", True, f"{e.cycles} cycles, none missing")
+    first = f", first at {e.at(int(np.append(gaps, twice).min()))}" if len(gaps) + len(twice) else ""
+    detail = f"{lost} cycles missing in {len(gaps)} gaps, {len(twice)} out of order{first}"
+    return Finding("completeness", False, detail)
+
+
+# --- time ------------------------------------------------------------------------------------------------------------
+
+
+def timing(e: Evidence) -> Finding:
+    """While the arm moves, cycles follow each other by the period; a longer pause must be declared late or missed."""
+    name, period = "timing", e.log.params.period_ns
+    spacing = np.diff(e.c["inputs.t_ns"])
+    if not len(spacing):
+        return _skip(name, "fewer than two cycles")
+    declared = (e.c["inputs.late"][1:] != 0) | (e.c["inputs.missed_ticks"][1:] > 0)
+    bad = e.moving[1:] & ((spacing <= 0) | ((spacing > SPACING * period) & ~declared))
+    worst = int(spacing.argmax())
+    spent = (e.c["timings.t_write_end_ns"] - e.c["timings.t_wake_ns"]) * 1e-6
+    p50, p99, most = (float(v) for v in (*np.percentile(spent, (50, 99)), spent.max()))
+    largest = float(spacing[worst]) * 1e-6
+    detail = (
+        f"period {period * 1e-6:g} ms, spacing median {np.median(spacing) * 1e-6:.3f}, largest {largest:.3f} ms; "
+        f"wake to sent p50 {p50:.3f}, p99 {p99:.3f}, largest {most:.3f} ms; {int(declared.sum())} cycles late"
+    )
+    if bad.any():
+        detail += f"; {int(bad.sum())} undeclared pauses, first at {e.at(int(bad.argmax()) + 1)}"
+    return Finding(name, not bad.any(), detail, False, largest, SPACING * period * 1e-6, "ms", e.at(worst + 1))
+
+
+def human_age(e: Evidence) -> Finding:
+    """In every cycle that works towards a goal the person's state is there, healthy and young enough."""
+    active = e.mode_after == Mode.ACTIVE
+    if not active.any():
+        return _skip("human age", "the arm was never active")
+    age, limit = e.c["inputs.human_age_ns"], e.log.params.human.age_limit_ns
+    there = (e.c["inputs.human.present"] == 1) & (e.c["inputs.human_fault"] == 0)
+    healthy = e.c["inputs.human.health"] != Health.FAULT
+    good = there & healthy & (age <= limit) & (age >= -e.log.params.human.future_limit_ns)
+    bad = active & ~good
+    if len(bad):
+        bad[-1] = False  # what the last cycle led to is not in the record
+    worst = int(np.where(active, age, np.iinfo(np.int64).min).argmax())
+    detail = "present, healthy and in time in every active cycle"
+    if bad.any():
+        detail = f"{int(bad.sum())} active cycles without a usable person, first at {e.at(int(bad.argmax()))}"
+    return Finding("human age", not bad.any(), detail, False, age[worst] * 1e-6, limit * 1e-6, "ms", e.at(worst))
+
+
+# --- limits ----------------------------------------------------------------------------------------------------------
+
+
+def _within(
+    e: Evidence, name: str, share: Column, unit: str, values: Column, limits: Column, start: int = 0
+) -> Finding:
+    """`share` of its limit that each joint uses in each cycle, (cycles, joints). More than 1 breaks it; NaN does."""
+    if not len(share):
+        return _skip(name, "no cycles")
+    used = np.where(np.isnan(share), np.inf, share)
+    cycle, joint = np.unravel_index(int(used.argmax()), used.shape)
+    holds = bool(used[cycle, joint] <= 1.0 + ROUNDING)
+    worst, limit = abs(float(values[cycle, joint])), float(limits[joint])
+    where = f"{e.log.params.robot.joints[joint]} at {e.at(int(cycle) + start)}"
+    margin = 1.0 - float(used[cycle, joint])
+    shown = max(margin, 0.0) if holds else margin
+    detail = f"greatest {worst:.4g} of {limit:.4g} {unit}, {where}; margin {shown:.1%}"
+    return Finding(name, holds, detail, False, worst, limit, unit, where)
+
+
+def position(e: Evidence) -> Finding:
+    """The measured joints stay inside their range."""
+    robot = e.log.params.robot
+    low, high = np.array(robot.q_min), np.array(robot.q_max)
+    heard, half = e.c["inputs.joint.present"] == 1, (high - low) / 2
+    off = np.where(heard[:, None], e.c["inputs.joint.q"] - (low + high) / 2, 0.0)
+    return _within(e, "joint position", np.abs(off) / half, "rad from the middle", off, half)
+
+
+def speed(e: Evidence) -> Finding:
+    limits = np.array(e.log.params.robot.dq_max)
+    dq = e.c["state.dq_cmd"]
+    return _within(e, "joint speed", np.abs(dq) / limits, "rad/s", dq, limits)
+
+
+def acceleration(e: Evidence) -> Finding:
+    limits = np.array(e.log.params.robot.ddq_max)
+    ddq = e.c["state.ddq_cmd"]
+    return _within(e, "joint acceleration", np.abs(ddq) / limits, "rad/s2", ddq, limits)
+
+
+def jerk(e: Evidence) -> Finding:
+    """Change of the commanded acceleration from one cycle to the next."""
+    if e.log.params.control == "torque":
+        return _skip("joint jerk", "a torque-controlled arm has no jerk limit")
+    limits = np.array(e.log.params.robot.dddq_max)
+    jerks = np.diff(e.c["state.ddq_cmd"], axis=0) / e.log.params.period
+    jerks[np.diff(e.c["inputs.tick"]) != 1] = 0.0  # across a gap nothing can be said
+    return _within(e, "joint jerk", np.abs(jerks) / limits, "rad/s3", jerks, limits, start=1)
+
+
+def torque(e: Evidence) -> Finding:
+    sent = e.c["outputs.command.kind"] == CommandKind.TORQUE
+    if not sent.any() or not e.log.params.robot.effort:
+        return _skip("joint torque", "no torques were sent")
+    limits = np.array(e.log.params.robot.effort)
+    tau = np.where(sent[:, None], e.c["outputs.command.tau"], 0.0)
+    return _within(e, "joint torque", np.abs(tau) / limits, "Nm", tau, limits)
+
+
+# --- people ----------------------------------------------------------------------------------------------------------
+
+
+def separation(e: Evidence) -> Finding:
+    """The measured arm does not by its own motion come nearer to a person than d_min. (A person who walks up to it
+    comes nearer, too; that the arm gives way is for the safety rows.)"""
+    d, limit = e.c["outputs.decision.d_measured"], e.log.params.safety.d_min
+    if not np.isfinite(d).any():
+        return _skip("separation", "nobody was near")
+    moves = (np.abs(e.c["inputs.joint.dq"]).max(axis=1) > STANDING) & (e.c["inputs.joint.present"] == 1)
+    near = np.flatnonzero(moves & (d < limit))
+    bad = near[approach(e, near) > APPROACH_M_S]
+    worst = int(d.argmin())
+    detail = (
+        f"nearest {d[worst]:.4f} m, bounds and all; nearer than d_min {limit:g} m in {int((d < limit).sum())} cycles"
+    )
+    if len(bad):
+        detail += f", in {len(bad)} of them by the arm's own motion, first at {e.at(int(bad[0]))}"
+    return Finding("separation", not len(bad), detail, False, float(d[worst]), limit, "m", e.at(worst))
+
+
+def approach(e: Evidence, cycles: Column) -> Column:
+    """How fast the arm itself, if people stood still, would come nearer to them in these cycles, m/s."""
+    system, h = System(e.log.params), 1e-3
+    found = np.zeros(len(cycles))
+    for k, i in enumerate(cycles):
+        _, x, _ = e.log.layout.unpack(e.log.record(int(i)))
+        if x.joint is not None:
+            ahead = dataclasses.replace(x, joint=dataclasses.replace(x.joint, q=vector(x.joint.q + h * x.joint.dq)))
+            found[k] = (nearest_measured(system, x) - nearest_measured(system, ahead)) / h
+    return found
+
+
+def safety_rows(e: Evidence) -> Finding:
+    """What was sent keeps every row of the safety index; where the ramp was shared, the record cannot show it."""
+    solved = np.isin(e.c["outputs.decision.status"], (Status.PASS, Status.FILTERED)) & (e.mode_after == Mode.ACTIVE)
+    whole = solved & (e.c["outputs.decision.share"] >= 1.0)
+    slack = np.where(whole, e.c["least_slack"], np.inf)
+    bad = slack < -MARGIN
+    phi = np.where(solved, e.c["worst_phi"], -np.inf)
+    if not np.isfinite(phi).any():
+        return _skip("safety rows", "no pair was active")
+    worst = int(phi.argmax())
+    shared = int((solved & ~whole).sum())
+    detail = f"worst phi {phi[worst]:.4g} at {e.at(worst)}; in {shared} cycles the ramp was shared"
+    if bad.any():
+        detail += f"; {int(bad.sum())} cycles break a row, first at {e.at(int(bad.argmax()))}"
+    return Finding("safety rows", not bad.any(), detail, False, float(phi[worst]), 0.0, "", e.at(worst))
+
+
+# --- stops and motion ------------------------------------------------------------------------------------------------
+
+
+def stop_times(e: Evidence) -> Finding:
+    """Every stop has a cause, and the set-points come to rest within what the limits allow."""
+    found = stops(e.c)
+    ticks, q = e.c["inputs.tick"], e.c["state.q_cmd"]
+    bad = []
+    for stop in found:
+        i = int(np.searchsorted(ticks, stop["cycle"]))
+        end = min(int(np.searchsorted(e.t_s, stop["t_s"] + stop["braking_s"])) + 1, e.cycles - 1)
+        allowed = _braking_time(e, i) + STOP_SLACK_S
+        stop["travel_rad"] = round(float(np.abs(q[end] - q[i]).max()), 6)
+        stop["allowed_s"] = round(allowed, 6)
+        cut = StopReason[stop["final_reason"]] >= StopReason.ROBOT_NOT_READY  # the robot stops by its own rule
+        if stop["reason"] == "NONE" or (stop["braking_s"] > allowed and not cut):
+            bad.append(stop)
+    e.notes["stops"] = found
+    if bad:
+        first = bad[0]
+        detail = f"{len(bad)} of {len(found)}: {first['reason']} at {first['t_s']} s braked {first['braking_s']} s"
+        return Finding("stops", False, f"{detail}, allowed {first['allowed_s']} s")
+    longest = max((s["braking_s"] for s in found), default=0.0)
+    causes = ", ".join(f"{s['reason']} at {s['t_s']:.3f} s" for s in found[:8])
+    detail = f"{len(found)} stops; longest {longest:.3f} s: {causes}" if found else "no stops"
+    return Finding("stops", True, detail, False, longest, None, "s")
+
+
+def _braking_time(e: Evidence, i: int) -> float:
+    """How long the slowest joint needs to rest from the set-point of cycle i, s: the acceleration to zero first, which
+    adds a^2 / 2J to the speed, then an S-curve with or without a plateau."""
+    robot, a = e.log.params.robot, np.abs(e.c["state.ddq_cmd"][i])
+    A, J = np.array(robot.ddq_max), np.array(robot.dddq_max)
+    v = np.abs(e.c["state.dq_cmd"][i]) + a * a / (2 * J)
+    curve = np.where(v * J < A * A, 2 * np.sqrt(v / J), v / A + A / J)
+    return float((a / J + curve).max())
+
+
+def no_motion(e: Evidence) -> Finding:
+    """Outside ACTIVE and STOPPING the set-point stands still."""
+    still = np.abs(np.diff(e.c["state.q_cmd"], axis=0)).max(axis=1, initial=0.0)
+    seeded = e.mode[:-1] == Mode.IDLE  # the first set-point is the measured pose
+    bad = (still > REST_STEP) & ~e.moving[:-1] & ~seeded
+    detail = f"{int((~e.moving).sum())} cycles at rest"
+    if bad.any():
+        detail = f"{int(bad.sum())} cycles moved, first at {e.at(int(bad.argmax()))}"
+    return Finding("no motion at rest", not bad.any(), detail)
+
+
+def armed(e: Evidence) -> Finding:
+    """Every way into ACTIVE is a person's ARM in that cycle."""
+    began = (e.mode_after == Mode.ACTIVE) & (e.mode != Mode.ACTIVE)
+    room = np.arange(e.c["inputs.events.kind"].shape[1]) < e.c["inputs.events.count"][:, None]
+    asked = ((e.c["inputs.events.kind"] == EventKind.ARM) & room).any(axis=1)
+    bad = began & ~asked
+    detail = f"armed {int(began.sum())} times, each time by the operator"
+    if bad.any():
+        detail = f"active without ARM at {e.at(int(bad.argmax()))}"
+    return Finding("armed by a person", not bad.any(), detail)
+
+
+# --- wire, certificate, replay ---------------------------------------------------------------------------------------
+
+
+def wire_bytes(e: Evidence) -> Finding:
+    """Every sent packet, decoded independently of the driver, says the recorded command."""
+    name = "sent bytes"
+    if f'"{audit_wire.STREAM_MOTION}"' not in e.log.session.get("driver", ""):
+        return _skip(name, "there is no independent decoder for this driver")
+    _, sent = packets(e.log)
+    if not sent:
+        return _skip(name, "no packets were recorded")
+    claims = np.flatnonzero((e.c["receipt.present"] == 1) & (e.c["receipt.ok"] == 1))
+    worst, at = 0.0, 0
+    for i in claims:
+        told = audit_wire.set_point(sent.get(int(e.c["receipt.t_tx_ns"][i]), b""))
+        same = told is not None and told.seq == e.c["receipt.seq"][i]
+        off = float(np.abs(told.q - e.c["outputs.command.q"][i]).max()) if told is not None and same else math.inf
+        if not off <= worst:
+            worst, at = off, int(i)
+        if not off <= audit_wire.ROUNDING:
+            return Finding(name, False, f"{e.at(int(i))}: the packet says something else", moment=e.at(int(i)))
+    detail = f"{len(claims)} set-points decode to the recorded commands, {worst:.1e} rad off at most"
+    return Finding(name, True, detail, False, worst, audit_wire.ROUNDING, "rad", e.at(at) if len(claims) else "")
+
+
+def certificate(e: Evidence) -> Finding:
+    """The certificate covered the mounted tool."""
+    if schema.CERTIFICATE not in e.log.attachments:
+        return _skip("certificate", "the cell names none")
+    return _skip("certificate", "attached, but its contents are not judged yet")
+
+
+def replayed(e: Evidence) -> Finding:
+    """The same code decides the same again."""
+    r = e.replay
+    if r is None or not r.cycles:
+        return _skip("replay", "no cycle was run again")
+    how = "bytes" if r.fingerprint_match else f"not exact: another machine, tolerance {r.tolerance:g}"
+    detail = f"{r.cycles} of {e.cycles} cycles run again ({how}), {r.mismatches} differ"
+    if r.first_difference is not None:
+        first = r.first_difference
+        detail += f"; first: cycle {first.cycle}, {first.field}: {first.logged} -> {first.replayed}"
+    return Finding("replay", r.mismatches == 0, detail)
+
+
+def wire(e: Evidence) -> Finding:
+    """Raw packets through the driver's codec give the record, and the record gives the packets."""
+    r = e.replay
+    if r is None:
+        return _skip("wire", "no cycle was run again")
+    how = f"of {r.cycles} cycles decoded again" if r.wire_decoded else "present (this driver's codec cannot be asked)"
+    detail = f"packets {how}, {r.wire_mismatches} mismatches" + (f"; first: {r.wire_first}" if r.wire_first else "")
+    return Finding("wire", r.wire_mismatches == 0, detail)
+
+
+RULES: tuple[Rule, ...] = (
+    identity, seals, signature, closed, records, completeness, timing, human_age, position, speed, acceleration, jerk,
+    torque, separation, safety_rows, stop_times, no_motion, armed, wire_bytes, wire, certificate, replayed,
+)  # fmt: skip
