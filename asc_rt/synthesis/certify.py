@@ -237,13 +237,13 @@ def _state(model: RobotModel, draw: Draw, why: str, extreme: Extreme) -> Worst:
 
 
 def recheck(certificate: Certificate, robot: RobotParams, tool: ToolParams) -> list[str]:
-    """The recorded worst states computed again by the code that runs the cell; why they differ, or empty.
-
-    The sampling kernel and the cycle's have no function for M in common, so this also holds them together.
-    """
+    """The recorded worst states computed again by the functions that the cycle calls; why they differ, or empty."""
     arm = robot_model.load(robot, tool, certificate.control)
     out = []
     for w in certificate.worst if certificate.ranges.joint_limits else ():
+        if w.capsule not in arm.capsule_names:
+            out.append(f"it is stale: {w.why}: the arm has no capsule {w.capsule} any more")
+            continue
         point, velocity = np.array([w.point]), np.array([w.velocity])
         people = People(point, point, velocity, velocity, np.zeros(1), np.zeros(1))
         a_h, q, dq = certificate.ranges.human_acceleration, np.array(w.q), np.array(w.dq)

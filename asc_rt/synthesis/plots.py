@@ -23,8 +23,8 @@ BARS = 60
 def save(result: Result, path: Path) -> list[Path]:
     """Writes PATH-distribution.png and PATH-poses.png; their names."""
     files = [path.with_name(f"{path.stem}-distribution.png"), path.with_name(f"{path.stem}-poses.png")]
-    distribution(result).savefig(files[0], dpi=110)
-    poses(result.certificate, result.model).savefig(files[1], dpi=110)
+    distribution(result).savefig(files[0], dpi=80)
+    poses(result.certificate, result.model).savefig(files[1], dpi=70)
     return files
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import beta
 
 from asc_rt.core.safety_index import BRAKE_SHARE
+from asc_rt.synthesis import synthesis
 from asc_rt.synthesis.synthesis import (
     Figures,
     approach_speed,
@@ -77,21 +78,31 @@ def test_no_cell_is_infeasible_at_the_synthesised_k_and_some_are_below(rho: floa
         assert wrong.worst is not None
 
 
-def test_the_proof_holds_against_points_drawn_at_random() -> None:
-    """Where verify() finds nothing no point of the box is infeasible; where it does, some point nearby is."""
+@pytest.mark.parametrize(("cells", "halvings"), [(24, 5), (2, 1), (3, 2)])
+def test_the_proof_holds_against_points_drawn_at_random(
+    cells: int, halvings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where verify() finds nothing no point of the box is infeasible, however coarse its cells."""
+    monkeypatch.setattr(synthesis, "CELLS", cells)
+    monkeypatch.setattr(synthesis, "HALVINGS", halvings)
     rng = np.random.default_rng(0)
-    for _ in range(30):
-        f = replace(FIGURES, rho=float(rng.uniform(1.0, 80.0)), d_min=float(rng.uniform(0.05, 0.3)))
-        f = replace(f, d_low=f.d_min)
+    refuted = 0
+    for i in range(120):
+        d_min = float(rng.uniform(0.05, 0.3))
+        rho = float(rng.uniform(0.0, 2.0 if i % 2 else 80.0))
+        f = replace(FIGURES, rho=rho, d_min=d_min, d_low=d_min)
         k = float(rng.uniform(0.5, 1.6)) * k_bound(f)
-        M_low, M_high = 2.0, float(rng.uniform(5.0, 100.0))
+        M_low = float(rng.uniform(0.3, 1.2)) * k * f.v_max / (f.d_high**2 - d_min**2)  # phi* = 0 near the far corner
+        M_high = M_low * float(rng.uniform(1.05, 4.0))
         d = rng.uniform(f.d_min, f.d_high, 20_000)
-        v, M = rng.uniform(0.0, f.v_max, 20_000), rng.uniform(M_low, M_high, 20_000)
+        v = rng.uniform(0.0, f.v_max, 20_000)
+        M = np.clip(k * v / (d * d - f.d_min**2 + rng.uniform(0.0, 0.01, 20_000)), M_low, M_high)  # near the layer
         phi = f.d_min**2 - d * d + k * v / M
         delta = f.period * (2.0 * d * v + k + k * v / M * f.rho)
         bad = (phi >= 0.0) & (phi <= delta) & (2.0 * d * v - BRAKE_SHARE * k + k * v / M * f.rho + f.eta * phi > 0.0)
-        if verify(f, k, M_low, M_high).infeasible == 0:
-            assert not bad.any()
+        refuted += bad.any()
+        assert not (bad.any() and verify(f, k, M_low, M_high).infeasible == 0)
+    assert 20 < refuted < 120
 
 
 def test_the_discrete_loop_stays_out_of_d_min_with_the_layers_k() -> None:
