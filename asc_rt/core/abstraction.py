@@ -1,7 +1,7 @@
 """The abstraction: arm and people -> per pair z = [d, d_dot], how the control enters d_ddot, and what it can realize.
 
-For a robot capsule and a human capsule let w = p_r - p_h join the nearest points of the two segments, D = |w|, n = w
-/ D.
+For a robot capsule and a human capsule let w = p_r - p_h join the nearest points of the two segments.
+D = |w|, n = w / D.
 
     d      = D - r_r - r_h                                    separation distance of the surfaces
     d_dot  = n . w_dot                                        w_dot = v_r - v_h at the nearest points
