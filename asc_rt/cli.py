@@ -88,6 +88,9 @@ def sim(
     cell: CellName = DEFAULT_CELL,
     port: Annotated[int | None, typer.Option(help="UDP port of the robot; default: the cell's driver.port")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="fanuc: exit 1 if the client broke the protocol")] = False,
+    faults: Annotated[
+        Path | None, typer.Option(help="fanuc: script of faults, TOML with [[faults]]", metavar="FILE")
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
     """One simulated device alone, for a controller elsewhere. Example: asc sim fanuc --port 60015"""
@@ -96,7 +99,8 @@ def sim(
 
     changes = [*(overrides or []), *([f"driver.port={port}"] if port is not None else [])]
     config = load_cell(cell, changes)
-    raise typer.Exit(run_device(config, device.value, ["--strict"] if strict else []))
+    options = [*(["--strict"] if strict else []), *(["--faults", str(faults)] if faults else [])]
+    raise typer.Exit(run_device(config, device.value, options))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})

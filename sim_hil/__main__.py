@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 
+from asc_rt import realtime
+
 USAGE = "usage: python -m sim_hil {fanuc CELL | human CELL | trials SUITE} [options]"
 
 
 def main(argv: list[str]) -> int:
     match argv:
         case ["fanuc", *rest]:
+            realtime.one_blas_thread()  # before numpy is imported
             from sim_hil.fanuc import server
 
             return server.main(rest)

@@ -49,6 +49,10 @@ class World:
     def dq(self) -> Array:
         return self._plant.dq
 
+    @property
+    def torque(self) -> Array:
+        return self._plant.torque
+
     def set_target(self, q: npt.ArrayLike) -> None:
         self._plant.set_target(q)
 

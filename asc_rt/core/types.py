@@ -49,7 +49,7 @@ class JointState:
     dq: Vector  # (n,) rad/s
     current: Vector  # (n,) A, motor currents (torque-controlled arms: Nm)
     flags: RobotFlag
-    tool_id: int  # 0 = the cell's configured tool
+    tool_id: int  # as the robot tells it; 0 = it tells none: the cell's tool; -1 = it should, and has not yet
     dq_is_estimated: bool  # True: differenced from q by the driver
 
 

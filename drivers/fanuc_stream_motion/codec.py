@@ -154,7 +154,7 @@ def _status(data: bytes) -> Status:
         q=joints_from_wire(plausible(fields[18:27], "joint angle")),
         current=vector(plausible(fields[27:36], "motor current")[:DOF]),
         every=max(1, bits >> 4),
-        inputs=fields[7] & fields[6],
+        inputs=fields[7] & fields[6] if fields[6] else None,
     )
 
 

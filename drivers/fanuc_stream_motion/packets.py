@@ -31,7 +31,7 @@ class Status:
     q: Vector  # (6,) rad, URDF
     current: Vector  # (6,) A
     every: int = 1  # the robot tells one status of so many (only while it brakes by itself)
-    inputs: int = 0  # the signals of the read window, lowest bit first
+    inputs: int | None = None  # the signals asked for, lowest bit first; None: it tells none (yet)
     emergency_stop: bool = False
     trouble: str = ""  # what else the robot says is wrong
 

@@ -45,6 +45,7 @@ LEAVE_TIMEOUT_NS = 1 * SECOND_NS  # to drain ten commands and to come to rest
 PERIOD_SAMPLES = 25  # 0.2 s: one late wake-up at either end stays far below PERIOD_TOLERANCE
 PERIOD_TOLERANCE = 0.25  # the possible periods (2, 4, 8 ms) are a factor of two apart
 REST_STEP = 1e-6  # rad a cycle
+TOOL_UNKNOWN = -1  # the classic wire tells signals only after the first command has asked for them
 RESTART_STEPS = 4  # so many numbers in a row far behind ours: the robot has begun to count anew
 
 
@@ -309,10 +310,16 @@ class Session:
             dq=dq,
             current=status.current,
             flags=status.flags | (RobotFlag.FAULTED if self.fault else RobotFlag(0)),
-            tool_id=status.inputs,
+            tool_id=self._tool(status),
             dq_is_estimated=True,
         )
         return self._joint
+
+    def _tool(self, status: Status) -> int:
+        window = self._common.window
+        if window is None:
+            return 0
+        return TOOL_UNKNOWN if status.inputs is None else status.inputs & window.mask
 
     # --- commands ------------------------------------------------------------------------------------------------
 

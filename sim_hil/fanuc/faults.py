@@ -6,11 +6,14 @@ A `FaultyController` is a controller for whoever drives it. Script entries: {at_
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 from sim_hil.fanuc.cabinet import Cabinet, Peer
+from sim_hil.fanuc.signals import IDENTITY_BITS
 
 STRANGER: Peer = ("127.0.0.2", 50001)
 NAN = bytes.fromhex("7ff8000000000000")  # as float64 and as float32
@@ -28,6 +31,7 @@ ROBOT = (
     "run_program",
     "sequence",
     "clock",
+    "tool",
     "power_off",
 )
 FAULTS = tuple(f"{fault}_{what}" for fault in LINE for what in ("status", "command")) + ROBOT
@@ -38,19 +42,51 @@ class Fault:
     at_s: float
     fault: str
     count: int = 1
-    value: int = 1  # delay [cycles], sequence number, clock jump [ms]
+    value: int = 1  # delay [cycles], sequence number, clock jump [ms], tool number (0: none)
 
     @classmethod
-    def parse(cls, entry: dict[str, Any]) -> Fault:
+    def parse(cls, entry: object) -> Fault:
         """ValueError: not a fault."""
-        known = [field.name for field in fields(cls)]
-        if set(entry) - set(known) or not {"at_s", "fault"} <= set(entry):
-            raise ValueError(f"a fault has {', '.join(known)}, not {', '.join(map(str, entry))}")
+        if not isinstance(entry, dict):
+            raise ValueError(f"a fault is a table with {', '.join(_KEYS)}, not {entry!r}")
+        if set(entry) - set(_KEYS) or not {"at_s", "fault"} <= set(entry):
+            raise ValueError(f"a fault has {', '.join(_KEYS)}, not {', '.join(map(str, entry))}")
         fault = cls(**entry)
         whole = type(fault.count) is int and type(fault.value) is int and fault.count > 0
         if fault.fault not in FAULTS or not whole or type(fault.at_s) not in (int, float) or fault.at_s < 0:
             raise ValueError(f"{entry} is no fault; faults: {', '.join(FAULTS)}")
+        if fault.fault == "tool" and not 0 <= fault.value < 2**IDENTITY_BITS:
+            raise ValueError(f"{entry}: tools are numbered 1 to {2**IDENTITY_BITS - 1}, 0: none")
         return fault
+
+
+def read_script(path: Path) -> list[Fault]:
+    """The [[faults]] of a TOML file. ValueError: it cannot be read, or one of them is none; one line each."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: malformed TOML: {error}") from error
+    if set(table) != {"faults"}:
+        raise ValueError(f"{path}: [[faults]] and nothing else is wanted, each with {', '.join(_KEYS)}")
+    return parse_script(table["faults"], str(path))
+
+
+def parse_script(entries: object, where: str) -> list[Fault]:
+    """ValueError: one line for each entry that is no fault."""
+    script, wrong = [], []
+    for number, entry in enumerate(entries if isinstance(entries, list) else [entries], 1):
+        try:
+            script.append(Fault.parse(entry))
+        except ValueError as error:
+            wrong.append(f"{where}: fault {number}: {error}")
+    if wrong:
+        raise ValueError("\n".join(wrong))
+    return script
+
+
+_KEYS = tuple(field.name for field in fields(Fault))
 
 
 class _Due(NamedTuple):
@@ -147,6 +183,8 @@ class FaultyController:
                 robot.jump_sequence(value)
             case "clock":
                 robot.jump_clock(value)
+            case "tool":
+                robot.signals.couple(value)
             case "power_off":
                 self._powered = False
             case _:

@@ -6,17 +6,17 @@ Exit code 0 after SIGTERM or SIGINT, 1 in strict mode with offences or without a
 from __future__ import annotations
 
 import argparse
-import gc
-import os
 import signal
 import socket
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from pathlib import Path
 
 import numpy as np
 
+from asc_rt import realtime
 from asc_rt.bus import BusError
 from asc_rt.config import Cell, ConfigError, load_cell
 from sim_hil.fanuc import wire, wire_b
@@ -24,7 +24,7 @@ from sim_hil.fanuc.arm import KinematicPlant, Plant
 from sim_hil.fanuc.cabinet import Cabinet, Peer
 from sim_hil.fanuc.controller import Controller
 from sim_hil.fanuc.controller_b import ControllerB
-from sim_hil.fanuc.faults import Fault, FaultyController
+from sim_hil.fanuc.faults import Fault, FaultyController, parse_script, read_script
 from sim_hil.fanuc.rmi_sockets import RmiSockets
 from sim_hil.fanuc.settings import Settings
 from sim_hil.world import World
@@ -47,6 +47,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("cell", help="cell file or name of a cell")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="put over the cell file")
     parser.add_argument("--strict", action="store_true", help="exit code 1 if the PC broke the protocol")
+    parser.add_argument("--faults", type=Path, metavar="FILE", help="TOML with [[faults]], added to the cell's")
     parser.add_argument(
         "--plant", choices=("mujoco", "kinematic"), default="mujoco", help="kinematic: no dynamics, no person, no bus"
     )
@@ -58,6 +59,7 @@ def main(argv: list[str]) -> int:
         try:
             cell = load_cell(args.cell, args.set)
             settings, script = _settings(cell)
+            script += read_script(args.faults) if args.faults else []
             link = stack.enter_context(_bind(cell))
             plant, publish = _plant(cell, settings, args.plant, stack)
             controller: Cabinet
@@ -81,7 +83,7 @@ def _settings(cell: Cell) -> tuple[Settings, list[Fault]]:
     if name not in VERSIONS:
         raise ValueError(f"the cell's driver is {name!r}, not one of {', '.join(map(repr, VERSIONS))}")
     table = {"period_ms": cell.params.period_ns * 1e-6, **cell.sim.get("fanuc", {})}
-    script = [Fault.parse(entry) for entry in table.pop("faults", [])]
+    script = parse_script(table.pop("faults", []), "sim.fanuc")
     return Settings.parse(table, VERSIONS[name]), script
 
 
@@ -123,7 +125,8 @@ def _run(
     stop: list[int],
     strict: bool,
 ) -> int:
-    _make_real_time()
+    for line in realtime.set_up(PRIORITY, None)["missing"]:
+        print(f"fanuc: less punctual, it lacks {line}", file=sys.stderr)
     print("ready fanuc {}:{}".format(*link.getsockname()), flush=True)
     cycles, skipped = serve(link, controller, script, others, stop)
     alarms = ", ".join(str(alarm) for alarm in controller.alarms) or "none"
@@ -174,16 +177,6 @@ def _drain(link: socket.socket) -> list[tuple[Peer, bytes]]:
             break
         packets.append((peer, data))
     return packets
-
-
-def _make_real_time() -> None:
-    """Best effort: without it the simulated robot is only less punctual."""
-    gc.collect()
-    gc.freeze()
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    except OSError as error:
-        print(f"fanuc: runs without real-time priority ({error.strerror})", file=sys.stderr)
 
 
 def _fail(error: object, code: int) -> int:

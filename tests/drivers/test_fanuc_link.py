@@ -11,6 +11,7 @@ import pytest
 from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, Vector, vector
 from drivers.base import HandshakeError, LinkError, ProtocolError, RobotFaulted, WriteReceipt
 from drivers.fanuc_stream_motion.link import StreamMotion
+from drivers.fanuc_stream_motion.session import TOOL_UNKNOWN
 from sim_hil.fanuc.arm import KinematicPlant
 from sim_hil.fanuc.controller import Controller, Program
 from sim_hil.fanuc.lockstep import Lockstep
@@ -504,7 +505,7 @@ def test_the_commanded_position_can_be_asked_before_the_first_command() -> None:
 
 def test_the_tool_is_read_from_its_signals() -> None:
     rig = Rig(options={"tool_input": "RI[3:6]"}, settings=Settings(tool=5))
-    assert rig.begin().tool_id == 0  # a session has to begin for that
+    assert rig.begin().tool_id == TOOL_UNKNOWN == -1  # asked for by the first command
     assert rig.run(10)[-1].tool_id == 5
     rig.controller.signals.couple(9)
     assert rig.run(2)[-1].tool_id == 9

@@ -83,6 +83,21 @@ def test_an_offence_is_printed_with_its_bytes(cell: Path, port: int, options: tu
     assert "1 offences" in out
 
 
+def test_a_script_of_faults_runs(cell: Path, port: int, tmp_path: Path) -> None:
+    script = tmp_path / "faults.toml"
+    script.write_text('[[faults]]\nat_s = 0.2\nfault = "emergency_stop"\n')
+    with server(cell, "--faults", str(script)) as process, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pc:
+        pc.settimeout(30.0)
+        pc.sendto(wire.write_request("start", 3), ("127.0.0.1", port))
+        while wire.read_reply(pc.recv(200))["status"] & 4:  # servo power
+            pass
+        _, out, _ = end(process)
+    assert "alarms: SRVO-002" in out
+    script.write_text("[[faults]]\nat_s = 0.2\n")
+    done = subprocess.run(command(cell, "--faults", str(script)), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "faults.toml: fault 1: a fault has" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sim_hil.fanuc import wire
 from sim_hil.fanuc.arm import ARMS, KinematicPlant, to_wire
 from sim_hil.fanuc.cabinet import MOVING, READY, SERVO_ON
 from sim_hil.fanuc.controller import Controller
-from sim_hil.fanuc.faults import FAULTS, Fault, FaultyController, Line
+from sim_hil.fanuc.faults import FAULTS, Fault, FaultyController, Line, parse_script, read_script
 from sim_hil.fanuc.settings import Settings
 from sim_hil.fanuc.signals import RI, RO, Signals, Unassigned
 from sim_hil.fanuc.tables import LR_MATE_200ID, LimitCheck
@@ -294,6 +295,36 @@ def test_a_script_runs_by_the_controllers_time() -> None:
     assert bench.alarms == ["SRVO-002"]
 
 
+def test_a_script_changes_the_tool() -> None:
+    bench = Bench(tool=5)
+    faulty = FaultyController(bench.controller, parse_script([{"at_s": 0.04, "fault": "tool", "value": 7}], "script"))
+    told = []
+    for _ in range(8):
+        faulty.cycle([])
+        told.append(bench.controller.signals.read(RI, 3, 0xF))
+    assert told == [5] * 5 + [7] * 3
+
+
+def test_a_script_in_a_file_names_every_wrong_entry(tmp_path: Path) -> None:
+    file = tmp_path / "faults.toml"
+    file.write_text("[[faults]]\nat_s = 1\nfault = 'lose_status'\n")
+    assert read_script(file) == [Fault(1, "lose_status")]
+    file.write_text("[[faults]]\nat_s = 1\nfault = 'toaster'\n[[faults]]\nfault = 'reset'\n")
+    with pytest.raises(ValueError, match=r"(?s)fault 1: .*toaster.*\n.*fault 2: a fault has at_s, fault") as caught:
+        read_script(file)
+    assert str(caught.value).count("\n") == 1
+    for text, says in (
+        ("at_s =", "malformed TOML"),
+        ("toaster = 1", "nothing else is wanted"),
+        ("faults = 3", "not 3"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=says):
+            read_script(file)
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_script(tmp_path / "nothing.toml")
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_fault_can_be_injected(fault: str) -> None:
     bench = Bench()
@@ -312,6 +343,7 @@ def test_every_fault_can_be_injected(fault: str) -> None:
         {"at_s": -1, "fault": "reset"},
         {"at_s": 1, "fault": "reset", "count": 0},
         {"at_s": 1, "fault": "reset", "colour": 1},
+        {"at_s": 1, "fault": "tool", "value": 16},
     ],
 )
 def test_a_wrong_script_is_refused(entry: dict[str, Any]) -> None:
