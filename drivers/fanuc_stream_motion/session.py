@@ -26,6 +26,7 @@ from drivers.base import (
 )
 from drivers.fanuc_stream_motion.braking import stop_way
 from drivers.fanuc_stream_motion.guard import Guard
+from drivers.fanuc_stream_motion.intake import Intake
 from drivers.fanuc_stream_motion.options import Options
 from drivers.fanuc_stream_motion.packets import (
     DOF,
@@ -46,7 +47,6 @@ PERIOD_SAMPLES = 25  # 0.2 s: one late wake-up at either end stays far below PER
 PERIOD_TOLERANCE = 0.25  # the possible periods (2, 4, 8 ms) are a factor of two apart
 REST_STEP = 1e-6  # rad a cycle
 TOOL_UNKNOWN = -1  # the classic wire tells signals only after the first command has asked for them
-RESTART_STEPS = 4  # so many numbers in a row far behind ours: the robot has begun to count anew
 
 
 class Session:
@@ -65,13 +65,11 @@ class Session:
         """As before any status or command."""
         self.counters = Counters()
         self.fault: RobotFaulted | None = None  # why the session was lost, as far as the robot tells
-        self._newest: Status | None = None
+        self._intake = Intake(self._receive, self.counters)
         self._joint: JointState | None = None  # the newest status as last given to the core
         self._sent: deque[Command] = deque(maxlen=3)
         self._sent_ns = 0
         self._sent_at_read: Command | None = None
-        self._backlog: deque[tuple[int, Status]] = deque()  # arrived, not yet their turn
-        self._behind: deque[int] = deque(maxlen=RESTART_STEPS)
 
     @property
     def foreign(self) -> int:
@@ -159,19 +157,20 @@ class Session:
         if self._phase in (Phase.CLOSED, Phase.CONFIGURED):
             raise LinkError("no session", hint="activate() comes before read()")
         if self._phase is Phase.MONITORING:
-            return self._read_newest(deadline_ns)
+            arrived = self._intake.await_newest(deadline_ns)
+            return self._accept(*arrived) if arrived else None
         return self._read_next(deadline_ns)
 
     def write(self, command: JointCommand) -> WriteReceipt:
         if command.kind is not CommandKind.POSITION:
             raise ValueError(f"a Stream Motion robot takes positions, not {command.kind.name}")
-        if self._newest is None or self._phase in (Phase.CLOSED, Phase.CONFIGURED):
+        if self._intake.newest is None or self._phase in (Phase.CLOSED, Phase.CONFIGURED):
             raise LinkError("no session", hint="activate() comes before write()")
         data = self._encode(self._next_number(), command.q, command.is_last)
         told = self._decode_command(data)
         if not self._is_asked_for(told.seq):
             return WriteReceipt(self._wire.now_ns(), told.seq, told.q, ok=False)
-        self._guard.refuse(told, self._sent, self._newest)
+        self._guard.refuse(told, self._sent, self._told())
         return WriteReceipt(self._command(data, told), told.seq, told.q, ok=True)
 
     def stop(self, request: StopRequest | None = None) -> None:
@@ -211,97 +210,41 @@ class Session:
 
     def _await_status(self) -> tuple[int, Status]:
         deadline_ns = self._wire.now_ns() + ANSWER_TIMEOUT_NS
-        packet = self._receive_status(deadline_ns)
-        if packet is None:
+        arrived = self._intake.await_one(deadline_ns)
+        if arrived is None:
             raise LinkError(
                 f"{self._common.address} sends no status",
                 hint="check the pendant for MOTN-607 (version) and whether another PC stopped the stream",
             )
-        self._newest = packet[1]
-        return packet
+        self._intake.newest = arrived[1]
+        return arrived
 
     # --- statuses ------------------------------------------------------------------------------------------------
 
-    def _read_newest(self, deadline_ns: int) -> JointState | None:
-        """Before the first command no status wants an answer: the newest counts."""
-        packet = self._receive_status(deadline_ns)
-        while packet is not None and (later := self._receive_status(0)) is not None:
-            packet = later
-        return self._accept(*packet) if packet else None
+    def _told(self) -> Status:
+        """The newest status; there is one in a session."""
+        assert self._intake.newest is not None
+        return self._intake.newest
 
     def _read_next(self, deadline_ns: int) -> JointState | None:
         before, self._sent_at_read = self._sent_at_read, self._sent[-1]
-        assert self._newest is not None
-        lost = sequence_distance(self._newest.seq, self._sent[-1].seq)
+        lost = sequence_distance(self._told().seq, self._sent[-1].seq)
         if self._sent[-1] is not before and 0 < lost <= QUEUE_CAPACITY:
             return self._joint  # once more, for a number that came between it and the sample before
-        while (packet := self._receive_status(deadline_ns)) is not None:
-            if sequence_distance(packet[1].seq, self._newest.seq) > 0:
-                self._behind.clear()
-                self._look_ahead(packet[1].seq)
-                return self._accept(*packet)
-            self.counters.stale += 1
-            if self._has_restarted(packet[1].seq):
-                return self._accept(*packet)
-        return None
-
-    def _look_ahead(self, newest: int) -> None:
-        """Take in what else has arrived: answered in one go, more than the buffer holds would overflow it."""
-        while (packet := self._receive(0)) is not None:
-            if isinstance(packet[1], Status):
-                self._backlog.append((packet[0], packet[1]))
-        behind = sequence_distance(self._backlog[-1][1].seq if self._backlog else newest, self._sent[-1].seq)
-        if behind > QUEUE_CAPACITY:
-            self._latch(
-                RobotFaulted(
-                    f"{behind} cycles were not answered in time, more than the robot buffers",
-                    hint="check cable, real-time set-up and load of this PC",
-                )
-            )
-
-    def _has_restarted(self, seq: int) -> bool:
-        """Old numbers come singly or in pairs; several that count up are a new session that somebody else began."""
-        if self._behind and sequence_distance(seq, self._behind[-1]) != 1:
-            self._behind.clear()
-        self._behind.append(seq)
-        if len(self._behind) < RESTART_STEPS:
-            return False
-        self._behind.clear()
-        self._latch(
-            RobotFaulted(
-                "the robot counts its statuses anew: another PC took the session",
-                hint="stop every other Stream Motion client, then start again",
-            )
-        )
-        return True
-
-    def _receive_status(self, deadline_ns: int) -> tuple[int, Status] | None:
-        if self._backlog:
-            return self._backlog.popleft()
-        while (packet := self._receive(deadline_ns)) is not None:
-            if isinstance(packet[1], Status):
-                return packet[0], packet[1]
-        return None
+        arrived = self._intake.await_next(deadline_ns, self._sent[-1].seq)
+        return self._accept(*arrived) if arrived else None
 
     def _accept(self, t_ns: int, status: Status) -> JointState:
+        self.fault = self.fault or self._intake.fault
         lost = not (status.ready and status.servo_on) or status.emergency_stop or bool(status.trouble)
         if lost and self._phase is Phase.STREAMING:
-            self._latch(self._diagnose(status))
+            self.fault = self.fault or self._diagnose(status)  # what happens after a lost session does not continue it
         return self._sample(t_ns, status)
 
-    def _latch(self, fault: RobotFaulted) -> None:
-        """What happens after a lost session is not a continuation of it."""
-        self.fault = self.fault or fault
-
     def _sample(self, t_ns: int, status: Status) -> JointState:
-        dq = vector(np.zeros(DOF))
-        if self._newest is not None:
-            cycles = sequence_distance(status.seq, self._newest.seq)
-            if cycles > 0:
-                self.counters.missing += max(0, cycles - status.every)
-                dq = vector((status.q - self._newest.q) / (cycles * self._period_ns * 1e-9))
-        self.counters.new += 1
-        self._newest = status
+        before, ahead = self._intake.newest, self._intake.take(status)
+        still = np.zeros(DOF)
+        dq = vector((status.q - before.q) / (ahead * self._period_ns * 1e-9) if before and ahead else still)
         self._joint = JointState(
             t_rx_ns=t_ns,
             t_device_ns=status.t_ms * 1_000_000,
@@ -324,13 +267,12 @@ class Session:
     # --- commands ------------------------------------------------------------------------------------------------
 
     def _next_number(self) -> int:
-        assert self._newest is not None
-        return (self._sent[-1].seq + 1) % SEQUENCE_SPAN if self._sent else self._newest.seq
+        return (self._sent[-1].seq + 1) % SEQUENCE_SPAN if self._sent else self._told().seq
 
     def _is_asked_for(self, seq: int) -> bool:
-        assert self._newest is not None
-        due = sequence_distance(self._newest.seq, seq) >= 0
-        return due and self._newest.ready and self.fault is None and self._phase is not Phase.FINISHED
+        newest = self._told()
+        due = sequence_distance(newest.seq, seq) >= 0
+        return due and newest.ready and self.fault is None and self._phase is not Phase.FINISHED
 
     def _command(self, data: bytes, told: Command) -> int:
         t_ns = self._send(data)
@@ -349,7 +291,7 @@ class Session:
             self._make(self._sent[-1].q, last=True)
         if self._sent:
             deadline_ns = self._wire.now_ns() + LEAVE_TIMEOUT_NS
-            while (packet := self._receive_status(deadline_ns)) is not None:
+            while (packet := self._intake.await_one(deadline_ns)) is not None:
                 if self._has_left(packet[1]):
                     break
 
