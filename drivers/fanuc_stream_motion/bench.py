@@ -20,9 +20,10 @@ import numpy as np
 from asc_rt.core.types import CommandKind, JointCommand, JointState, vector
 from drivers.base import LinkError
 from drivers.fanuc_stream_motion import codec
-from drivers.fanuc_stream_motion.limits import LimitCheck
+from drivers.fanuc_stream_motion.arms import ARMS
+from drivers.fanuc_stream_motion.limits import LimitCheck, Tables
 from drivers.fanuc_stream_motion.link import StreamMotion
-from drivers.fanuc_stream_motion.packets import DOF, PORT
+from drivers.fanuc_stream_motion.packets import DOF, PORT, STAGES, Thresholds
 from drivers.fanuc_stream_motion.transport import UdpTransport
 
 REPETITIONS = 20_000
@@ -59,10 +60,15 @@ class StampedTransport(UdpTransport):
         return t_ns, data
 
 
+def _tables() -> list[Thresholds]:
+    wide = vector(np.full(STAGES, 1e6))
+    return [Thresholds(axis + 1, kind, 4.0, wide, wide) for kind in range(3) for axis in range(DOF)]
+
+
 def bench_codec(version: int, repetitions: int = REPETITIONS) -> list[int]:
     """ns per cycle of everything that turns bytes into numbers and back."""
     status = struct.pack(">III BBHHH I 27f", 0, version, 7, 5, 0, 0, 0, 0, 0, *np.linspace(-90, 90, 27))
-    check = LimitCheck(np.full((3, DOF), 1e3), PERIOD_NS * 1e-9)
+    check = LimitCheck(Tables(_tables(), 1.0), ARMS["lrmate_200id"], PERIOD_NS * 1e-9)
     spent = []
     for _ in range(repetitions):
         began = time.perf_counter_ns()

@@ -25,6 +25,7 @@ from drivers.fanuc_stream_motion.packets import (
     VersionReply,
     Window,
     check_set_point,
+    place_from_wire,
     plausible,
     set_point_degrees,
 )
@@ -144,13 +145,13 @@ def decode_thresholds(data: bytes) -> Thresholds:
 def _status(data: bytes) -> Status:
     fields = _sized(_STATUS_LAYOUT, data, "status")
     bits = fields[3]
-    plausible(fields[9:18], "pose")
     return Status(
         seq=fields[2],
         ready=bool(bits & 0x01),
         servo_on=bool(bits & 0x04),
         moving=bool(bits & 0x08),
         t_ms=fields[8],
+        place=place_from_wire(fields[9:18]),
         q=joints_from_wire(plausible(fields[18:27], "joint angle")),
         current=vector(plausible(fields[27:36], "motor current")[:DOF]),
         every=max(1, bits >> 4),

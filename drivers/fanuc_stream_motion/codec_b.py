@@ -22,6 +22,7 @@ from drivers.fanuc_stream_motion.packets import (
     Thresholds,
     Window,
     check_set_point,
+    place_from_wire,
     plausible,
     set_point_degrees,
 )
@@ -29,7 +30,7 @@ from drivers.fanuc_stream_motion.packets import (
 VERSIONS = (3, 4)
 
 _STOP, _THRESHOLDS, _GET_CAPABILITY, _SET_CAPABILITY = 2, 3, 7, 8
-_START, _COMMAND, _STATUS, _GPIO, _STATUS_FORCE = 200, 201, 202, 203, 204
+_START, _COMMAND, _STATUS, _GPIO, _STATUS_FORCE, _FORCE_SENSOR = 200, 201, 202, 203, 204, 205
 # The field is called unused in the published headers. It is not: anything but this value makes the controller read the
 # nine numbers as a Cartesian pose, and the arm slews there.
 JOINT_DATA = 0xFFFF
@@ -44,8 +45,10 @@ _STATUS_LAYOUT = struct.Struct(">III BBBB I 9f 9f 9f f 256s")
 _STATUS_FORCE_LAYOUT = struct.Struct(">III BBBB I 9f 9f 9f f 6f I 256s")
 _SLOT = struct.Struct(">4I")  # kind, signal type, first, length
 _GPIO_RESULT = struct.Struct(">3I")
+_FORCE = struct.Struct(">4I")  # reset, sensor
 _SLOT_STATE = 2  # the robot tells the signals
 _SIGNAL_TYPES = {"DO": 0, "DI": 1, "RO": 2, "RI": 3}
+FORCE_SENSORS = {"embedded": 1, "external": 2}  # others: none is chosen, none is there
 _CONTACT = ("", "contact stop: safe", "contact stop", "contact stop disabled", "contact stop: escape")
 
 
@@ -71,6 +74,16 @@ def encode_stop(version: int) -> bytes:
 
 def encode_capability_request(version: int) -> bytes:
     return _CAPABILITY.pack(_GET_CAPABILITY, version, 1, 0, 0, 0, 0)
+
+
+def encode_start_move(version: int, commands: int) -> bytes:
+    """So many commands are buffered before the arm moves; statuses tell the face plate, not the tool."""
+    return _CAPABILITY.pack(_SET_CAPABILITY, version, 1, 0, commands, 0, 0)
+
+
+def encode_force_sensor(version: int, sensor: str) -> bytes:
+    """From now on the statuses carry the forces of `sensor`. Version 3 takes the packet for a system error."""
+    return _FORCE.pack(_FORCE_SENSOR, version, 0, FORCE_SENSORS[sensor])
 
 
 def encode_threshold_request(version: int, axis: int, kind: int) -> bytes:
@@ -129,7 +142,7 @@ def _status(data: bytes, layout: struct.Struct) -> Status:
     bits, robot, contact = fields[3:6]
     if contact >= len(_CONTACT):
         raise ProtocolError(f"contact stop {contact}")
-    plausible((*fields[8:17], *fields[35:36], *fields[36:-2]), "pose, safety scale or force")
+    plausible(fields[35:36], "safety scale")
     troubles = ("alarm" * (robot & 1), "teach pendant enabled" * (robot >> 1 & 1), _CONTACT[contact])
     return Status(
         seq=fields[2],
@@ -137,12 +150,22 @@ def _status(data: bytes, layout: struct.Struct) -> Status:
         servo_on=bool(bits & 0x04),
         moving=bool(bits & 0x08),
         t_ms=fields[7],
+        place=place_from_wire(fields[8:17]),
         q=vector(np.radians(plausible(fields[17:26], "joint angle")[:DOF])),
         current=vector(plausible(fields[26:35], "motor current")[:DOF]),
         inputs=int.from_bytes(fields[-1][:4], "little"),
+        force=_force(fields[36:-1]),
         emergency_stop=bool(robot & 4),
         trouble=", ".join(trouble for trouble in troubles if trouble),
     )
+
+
+def _force(fields: tuple[float, ...]) -> Vector | None:
+    """Three forces and three moments, and of which sensor they are; a version 3 status has no such fields."""
+    if not fields:
+        return None
+    force = vector(plausible(fields[:6], "force"))
+    return force if fields[6] in FORCE_SENSORS.values() else None
 
 
 def _capability(data: bytes) -> Capability:

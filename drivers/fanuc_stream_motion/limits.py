@@ -3,6 +3,9 @@
 The controller takes backward differences of the set-points (v = dp / T, a = dv / T, j = da / T, everything before the
 first equal to it) and compares them with tables over flange speed and payload. Whether it does so with its own J3
 (against the horizontal) or with the mechanical one is not public: both are kept inside the table of axis 3.
+
+The core's stop needs limits that do not change under way, so it gets one box for every flange speed up to a greatest
+one. The check goes by the flange speed of the moment, and is there for a flange that is faster still.
 """
 
 from __future__ import annotations
@@ -10,11 +13,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import dist
 
 import numpy as np
 
 from asc_rt.core.types import Matrix, Vector, vector
 from drivers.base import JointLimits
+from drivers.fanuc_stream_motion.arms import Arm, Point
 from drivers.fanuc_stream_motion.packets import DOF, STAGES, Thresholds
 
 KINDS = ("velocity", "acceleration", "jerk")
@@ -25,49 +30,51 @@ FLOAT32_STEP = np.radians(2.0**-16)  # rad, half the distance of float32 angles 
 
 
 class Tables:
-    """All tables of the six axes. ValueError: one is missing, or a limit is not positive."""
+    """All tables of the six axes at one payload (0 none ... 1 full). ValueError: one is missing, or not positive."""
 
-    def __init__(self, told: Sequence[Thresholds]) -> None:
+    def __init__(self, told: Sequence[Thresholds], payload: float) -> None:
         by_place = {(t.kind, t.axis): t for t in told}
         wanted = [(kind, axis) for kind in range(3) for axis in range(1, DOF + 1)]
         missing = [place for place in wanted if place not in by_place]
         if missing:
             raise ValueError(f"no table of (kind, axis) {missing}")
         rows = [by_place[place] for place in wanted]
-        self.max_speed = rows[0].max_speed  # m/s
-        self._no_payload = np.array([t.no_payload for t in rows]).reshape(3, DOF, STAGES)
-        self._full_payload = np.array([t.full_payload for t in rows]).reshape(3, DOF, STAGES)
-        if not (self._no_payload.min() > 0 and self._full_payload.min() > 0):
+        if min(min(t.no_payload.min(), t.full_payload.min()) for t in rows) <= 0:
             raise ValueError("the robot tells limits that are not positive")
+        self.max_speed = rows[0].max_speed  # m/s
+        without, full = np.array([t.no_payload for t in rows]), np.array([t.full_payload for t in rows])
+        # (stages, 3 kinds, 6 axes): what is asked for in each cycle lies together
+        self._stages = np.ascontiguousarray(
+            (without + payload * (full - without)).reshape(3, DOF, STAGES).transpose(2, 0, 1)
+        )
 
-    def at(self, speed: float, payload: float) -> Matrix:
-        """(3 kinds, 6 axes) rad/s, rad/s2, rad/s3 at a flange speed [m/s] and a payload (0 none ... 1 full).
+    def at(self, speed: float) -> Matrix:
+        """(3 kinds, 6 axes) rad/s, rad/s2, rad/s3 at a flange speed [m/s].
 
         Linear between stages and payloads; below the first stage the first; above the last along the last slope.
         """
-        table = self._no_payload + payload * (self._full_payload - self._no_payload)
         place = max(0.0, STAGES * speed / self.max_speed - 1.0)
         low = min(int(place), STAGES - 2)
-        below, above = table[:, :, low], table[:, :, low + 1]
+        below, above = self._stages[low], self._stages[low + 1]
         return np.asarray(below + (place - low) * (above - below))
 
-    def least_up_to(self, speed: float, payload: float) -> Matrix:
+    def least_up_to(self, speed: float) -> Matrix:
         """The least limits at any flange speed up to `speed`: (3, 6). Linear in between, so the stages decide."""
         stages = [k * self.max_speed / STAGES for k in range(1, STAGES + 1)]
-        return np.min([self.at(s, payload) for s in [*(s for s in stages if s < speed), speed]], axis=0)
+        return np.min([self.at(s) for s in [*(s for s in stages if s < speed), speed]], axis=0)
 
 
-def joint_limits(limits: Matrix, rounding: float, period: float) -> JointLimits:
-    """The box of URDF joint limits inside `limits` (3, 6), MARGIN below them.
+def joint_limits(tables: Tables, flange_speed: float, rounding: float, period: float) -> JointLimits:
+    """The box of URDF joint limits inside the tables up to `flange_speed` [m/s], MARGIN below them.
 
     J3_fanuc = J3_urdf - J2, so J2 and J3 share the table of axis 3 in the ratio of their own: b2 + b3 = L3 with
     b2 : b3 = L2 : L3. A box, not a coupled row: joints that brake each on its own then stay inside as well.
     `rounding`: rad, by how much the wire may round an angle; differenced k times it becomes 2^k rounding / T^k.
     """
     boxes = []
-    for kind in range(3):
+    for kind, limits in enumerate(tables.least_up_to(flange_speed)):
         noise = 2 ** (kind + 1) * rounding / period ** (kind + 1)
-        box = (1.0 - MARGIN) * limits[kind] - noise
+        box = (1.0 - MARGIN) * limits - noise
         third = box[2] - noise  # two rounded angles
         second = min(box[1], third * box[1] / (box[1] + box[2]))
         box[1], box[2] = second, third - second
@@ -81,33 +88,49 @@ class Breach:
     axis: int  # 1-6
     value: float  # rad/s, rad/s2 or rad/s3
     limit: float
+    speed: float  # m/s of the flange
 
     def __str__(self) -> str:
         value, limit = np.degrees([self.value, self.limit])
-        return f"J{self.axis} {KINDS[self.kind]} {value:.5g}, the robot's limit is {limit:.5g} {UNITS[self.kind]}"
+        return (
+            f"J{self.axis} {KINDS[self.kind]} {value:.5g}, the robot's limit is {limit:.5g} {UNITS[self.kind]}"
+            f" at a flange speed of {self.speed:.3g} m/s"
+        )
 
 
 class LimitCheck:
-    """Holds the set-points, as the wire rounds them, against the tables."""
+    """Holds the set-points, as the wire rounds them, against the tables at the speed that the flange has.
 
-    def __init__(self, limits: Matrix, period: float) -> None:
-        self._limits = (1.0 - REFUSE) * np.column_stack([limits, limits[:, 2]])  # (3, 7), the seventh: FANUC's J3
-        self._period = period
+    Of this period and the one before: which of them the controller takes is not public.
+    """
+
+    def __init__(self, tables: Tables, arm: Arm, period: float) -> None:
+        self._tables, self._arm, self._period = tables, arm, period
         self._past: deque[Vector] = deque(maxlen=3)
+        self._place: Point | None = None  # of the flange, at the newest of them
+        self._speed = 0.0
 
     def breach(self, q: Vector) -> Breach | None:
         """What the set-point `q` (6,) rad would break, if it came next."""
-        past = self._past or deque([q] * 3)
-        rows = np.array([*past, q])
+        speed = self._speed_to(q)
+        limits = np.minimum(self._tables.at(self._speed), self._tables.at(speed))
+        limits = (1.0 - REFUSE) * np.column_stack([limits, limits[:, 2]])  # (3, 7), the seventh: FANUC's J3
+        rows = np.array([*(self._past or [q] * 3), q])
         rows = np.column_stack([rows, rows[:, 2] - rows[:, 1]])
         for kind in range(3):
             rows = np.diff(rows, axis=0) / self._period
-            over = np.abs(rows[-1]) - self._limits[kind]
+            over = np.abs(rows[-1]) - limits[kind]
             axis = int(np.argmax(over))
             if over[axis] > 0:
-                return Breach(kind, 3 if axis == 6 else axis + 1, abs(float(rows[-1, axis])), self._limits[kind, axis])
+                joint = 3 if axis == 6 else axis + 1
+                return Breach(kind, joint, abs(float(rows[-1, axis])), float(limits[kind, axis]), speed)
         return None
 
     def sent(self, q: Vector) -> None:
         """`q` is out."""
+        self._speed = self._speed_to(q)
+        self._place = self._arm.place(q)
         self._past.extend([q] if self._past else [q] * 3)
+
+    def _speed_to(self, q: Vector) -> float:
+        return 0.0 if self._place is None else dist(self._arm.place(q), self._place) / self._period

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from asc_rt.core.types import Vector
 from drivers.base import DriverError, HandshakeError, LinkError, RobotFaulted, WireTap
 from drivers.fanuc_stream_motion import alarms, codec_b
 from drivers.fanuc_stream_motion.options import Check, Options, is_number, is_port
@@ -31,10 +32,14 @@ class RosOptions(Options):
     NAME: ClassVar[str] = "fanuc-stream-motion-b"
     CHECKS: ClassVar[dict[str, Check]] = {
         "rmi_port": (is_port, "a TCP port, 1 to 65535"),
+        "start_move": (lambda v: type(v) is int and 0 <= v <= 9, "commands, 0 to 9"),
+        "force_sensor": (lambda v: v in codec_b.FORCE_SENSORS, f"one of {tuple(codec_b.FORCE_SENSORS)}"),
         "settle": (lambda v: is_number(v, 0, 60), "seconds, 0 to 60"),
     }
 
     rmi_port: int = RMI_PORT
+    start_move: int | None = None  # commands that the robot buffers before it moves; None: as it is set
+    force_sensor: str = ""  # whose forces the statuses carry; "": none
     settle: float = 2.0  # s that the robot must stay ready: a second after a repeated call it is not, briefly. MEASURED
 
 
@@ -57,6 +62,11 @@ class StreamMotionB(Session):
         super().close()
         self._rmi.close()
 
+    @property
+    def force(self) -> Vector | None:
+        """(6,) N and Nm of the chosen sensor, as the newest status tells; None: it tells none."""
+        return None if self._intake.newest is None else self._intake.newest.force
+
     # --- handshake -----------------------------------------------------------------------------------------------
 
     def _identify(self) -> str:
@@ -76,11 +86,30 @@ class StreamMotionB(Session):
                 hint="use the driver fanuc-j519 for this controller",
             )
         self._version = min(capability.version, max(codec_b.VERSIONS))
+        self._configure()
         if self._options.limits:
             self._guard.take(self._ask_tables())
         if self._options.window is not None:
             self._ask_signals()
         return f"FANUC Stream Motion (ROS 2 wire) v{self._version} at {self._options.address}"
+
+    def _configure(self) -> None:
+        """What the cell wants of the controller. HandshakeError: it cannot."""
+        wanted = self._options.start_move
+        if self._options.force_sensor and self._version < 4:
+            raise HandshakeError(
+                f"the robot speaks version {self._version}, which has no force data",
+                hint="take driver.force_sensor out of the cell file, or have the controller's software updated",
+            )
+        if wanted is None:
+            return
+        self._send(codec_b.encode_start_move(self._version, wanted))
+        told = self._await(codec_b.Capability)
+        if told is None or told.start_move != wanted:
+            raise HandshakeError(
+                f"the robot does not take start_move = {wanted}",
+                hint="take driver.start_move out of the cell file, and set it at the pendant",
+            )
 
     def _ask_tables(self) -> list[Thresholds]:
         told: list[Thresholds] = []
@@ -114,6 +143,8 @@ class StreamMotionB(Session):
         """The call comes before Start: the other way round the robot never gets ready."""
         self._rmi.start(PROGRAM)
         self._send(codec_b.encode_start(self._version))
+        if self._options.force_sensor:
+            self._send(codec_b.encode_force_sensor(self._version, self._options.force_sensor))
 
     def _await_ready(self) -> tuple[int, Status]:
         settle_ns = round(self._options.settle * SECOND_NS)

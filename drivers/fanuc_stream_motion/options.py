@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, TypeVar
 
 from drivers.fanuc_stream_motion import codec
+from drivers.fanuc_stream_motion.arms import ARMS
 from drivers.fanuc_stream_motion.packets import PORT, Window
 
 Check = tuple[Callable[[Any], bool], str]
@@ -24,9 +25,10 @@ class Options:
     host: str
     port: int = PORT
     ready_timeout: float = 10.0  # s, for the program on the robot to wait for set-points
+    arm: str = ""  # one of ARMS: the tables go by the speed of its flange; its pose is compared with the robot's
     limits: bool = False  # read the controller's limit tables, tell them, and refuse set-points beyond them
     payload_share: float = 1.0  # payload set at the controller; 1 = full, which it takes if none is set
-    flange_speed: float = 0.0  # m/s, the fastest that the flange may move, for the tables; 0: their last stage
+    flange_speed: float = 0.0  # m/s up to which the limits that are told hold; 0: the last stage of the tables
     tool_input: str = ""  # signals that number the tool in the changer, such as "RI[3:6]"; "": it stays 0
     lock_dir: str | None = None  # of the owner lock; default: the system's directory for temporary files
 
@@ -48,6 +50,8 @@ class Options:
         for key, (good, meaning) in {**_COMMON, **cls.CHECKS}.items():
             if key in table and not good(table[key]):
                 wrong.append(f"{key} must be {meaning}, not {table[key]!r}")
+        if table.get("limits") is True and "arm" not in table:
+            wrong.append(f"arm is missing: limits go by the speed of its flange; one of {tuple(ARMS)}")
         if wrong:
             raise ValueError(f"{cls.NAME}: " + "; ".join(wrong))
         return cls(**table)
@@ -87,6 +91,7 @@ _COMMON: dict[str, Check] = {
     "host": (lambda v: isinstance(v, str) and bool(v), "a host name or address"),
     "port": (is_port, "a UDP port, 1 to 65535"),
     "ready_timeout": (lambda v: is_number(v, 1e-3, 3600), "seconds, above 0"),
+    "arm": (lambda v: isinstance(v, str) and v in ARMS, f"one of {tuple(ARMS)}"),
     "limits": (lambda v: isinstance(v, bool), "true or false"),
     "payload_share": (lambda v: is_number(v, 0, 1), "a share, 0 to 1"),
     "flange_speed": (lambda v: is_number(v, 0, 20), "m/s, 0 to 20"),

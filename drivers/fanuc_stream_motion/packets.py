@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from asc_rt.core.types import RobotFlag, Vector
+from asc_rt.core.types import RobotFlag, Vector, vector
 from drivers.base import ProtocolError
 
 PORT = 60015
@@ -29,9 +29,11 @@ class Status:
     moving: bool
     t_ms: int  # controller clock, steps of 2 ms: never differentiate it
     q: Vector  # (6,) rad, URDF
+    place: Vector  # (3,) m, the flange in the world frame
     current: Vector  # (6,) A
     every: int = 1  # the robot tells one status of so many (only while it brakes by itself)
     inputs: int | None = None  # the signals asked for, lowest bit first; None: it tells none (yet)
+    force: Vector | None = None  # (6,) N and Nm at the flange's sensor; None: there is none, or it is not chosen
     emergency_stop: bool = False
     trouble: str = ""  # what else the robot says is wrong
 
@@ -118,6 +120,11 @@ def plausible(values: tuple[float, ...], what: str) -> Vector:
     if not (abs(array) <= _PLAUSIBLE).all():  # false for NaN too
         raise ProtocolError(f"{what} is not a plausible number: {values}")
     return array
+
+
+def place_from_wire(pose: tuple[float, ...]) -> Vector:
+    """X, Y, Z of the nine numbers of a pose, mm -> m. ProtocolError: not numbers to go by."""
+    return vector(plausible(pose, "pose")[:3] * 1e-3)
 
 
 def set_point_degrees(axes: Vector) -> list[float]:

@@ -148,6 +148,7 @@ class Session:
             self._begin()
             self._measure_period(period_ns)
             t_ns, status = self._await_ready()
+            self._guard.check_pose(status)
         except DriverError:
             self.stop()
             raise

@@ -28,6 +28,7 @@ _DIP_AT_S, _DIP_S = 1.0, 0.6  # after a repeated call: not ready, for less than 
 _ENDURED = ((15.3, 0.121), (49.9, 0.071))
 _SIGNAL_TYPES = {0: DO, 1: DI, 2: RO, 3: RI}
 _LAST_AT_REST = 1e-4  # rad
+MOST_BUFFERED = 9  # commands before motion. DATASHEET
 
 
 class Command(NamedTuple):
@@ -47,6 +48,9 @@ class ControllerB(Cabinet):
         self.over_limit = 0  # cycles that had to be smoothed
         self.silent_stops = 0  # times that the arm was stopped because nothing came
         self._limits = LimitCheck(self.arm.tables, s.payload_share, s.period, self._flange_mm)
+        self.force = np.zeros(6)  # N and Nm that the sensor feels
+        self._force_sensor = 0  # not chosen
+        self._start_move = s.start_move
         self._peer: Peer | None = None
         self._version = 0
         self._slots: list[tuple[int, int, int]] = []  # signals that the statuses tell: type, first, length
@@ -143,7 +147,7 @@ class ControllerB(Cabinet):
         return out
 
     def _move(self) -> None:
-        if self._queue and (len(self._queue) > self.settings.start_move or self._queue[-1].last):
+        if self._queue and (len(self._queue) > self._start_move or self._queue[-1].last):
             self._draining = True
         if self.alarms or self.contact_stop or self.pendant_enabled or self._gave_up:
             self._queue.clear()
@@ -202,7 +206,7 @@ class ControllerB(Cabinet):
             return None
         answers: dict[str, Any] = {
             "get_capability": self._capability,
-            "set_capability": self._capability,
+            "set_capability": self._set_capability,
             "thresholds": self._thresholds,
             "gpio": self._configure_signals,
         }
@@ -216,6 +220,9 @@ class ControllerB(Cabinet):
             self._forget()
         elif packet.name == "start":
             self._start(peer, packet, data)
+        elif packet.name == "force":
+            self._force_sensor = packet["force_sensor"]
+            self.force[:] *= not packet["do_reset"]
         elif packet.name == "command":
             self._command(peer, packet, data)
         return None
@@ -270,9 +277,13 @@ class ControllerB(Cabinet):
             packet.version,
             id=1,
             sampling_rate=int(s.period_ms),
-            start_move=s.start_move,
+            start_move=self._start_move,
             available_version=s.version,
         )
+
+    def _set_capability(self, packet: Packet) -> bytes:
+        self._start_move = min(packet["start_move"], MOST_BUFFERED)
+        return self._capability(packet)
 
     def _thresholds(self, packet: Packet) -> bytes:
         reply = thresholds(self.arm.tables, packet["axis"], packet["kind"])
@@ -299,6 +310,10 @@ class ControllerB(Cabinet):
             self.signals.read(kind, first, (1 << length) - 1).to_bytes(4, "little")
             for kind, first, length in self._slots
         )
+        sensed: dict[str, object] = {}
+        if self._version >= 4:
+            force = self.force * (self._force_sensor in (1, 2))
+            sensed = {"force": force[:3], "moment": force[3:], "force_sensor": self._force_sensor}
         return wire_b.write_reply(
             "status" if self._version < 4 else "status_force",
             self._version,
@@ -312,6 +327,7 @@ class ControllerB(Cabinet):
             current=self.currents,
             safety_scale=self.safety_scale,
             signals=np.frombuffer(told.ljust(wire_b.SIGNAL_BYTES, b"\0"), "u1"),
+            **sensed,
         )
 
 

@@ -41,7 +41,9 @@ class Rig:
             self.faulty = FaultyController(self.robot)
             self.line = Lockstep(self.faulty)
             self.driver = StreamMotion(
-                {"host": "robot", "limits": True, **(options or {})}, self._note, transport=self.line
+                {"host": "robot", "limits": True, "arm": "lrmate_200id", **(options or {})},
+                self._note,
+                transport=self.line,
             )
         else:
             crx = {"arm": "crx_10ia_l", "start_move": 2, "filter_cycles": 1, "lag_ms": 110.0}
@@ -50,7 +52,7 @@ class Rig:
             self.line = Lockstep(self.faulty)
             self.rmi = RmiServer(controller, 16002)
             self.driver = StreamMotionB(
-                {"host": "robot", "limits": True, "settle": 0.1, **(options or {})},
+                {"host": "robot", "limits": True, "arm": "crx_10ia_l", "settle": 0.1, **(options or {})},
                 self._note,
                 transport=self.line,
                 line=RmiLine(self.line, self.rmi),

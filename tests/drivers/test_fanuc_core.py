@@ -52,12 +52,12 @@ class Cell:
             self.robot = controller = ControllerB(plant, settings)
             self.link = Lockstep(controller)
             line = RmiLine(self.link, RmiServer(controller, 16002))
-            options = {"host": "robot", "limits": True, "settle": 0.1}
+            options = {"host": "robot", "limits": True, "arm": "crx_10ia_l", "settle": 0.1}
             self.driver = StreamMotionB(options, transport=self.link, line=line)
         else:
             self.robot = Controller(plant, settings)
             self.link = Lockstep(self.robot)
-            options = {"host": "robot", "limits": True, "version": version}
+            options = {"host": "robot", "limits": True, "arm": "lrmate_200id", "version": version}
             self.driver = StreamMotion(options, transport=self.link)
         limits = self.driver.configure().limits
         self.system = System(within(cell.params, limits) if told else cell.params)

@@ -78,6 +78,7 @@ def there(k: int) -> Vector:
 
 
 STRICT = Settings(limits=True)
+LIMITS = {"limits": True, "arm": "lrmate_200id"}
 
 
 def slowly(k: int) -> Vector:
@@ -191,7 +192,7 @@ def test_what_an_earlier_session_left_in_the_socket_is_thrown_away() -> None:
 @pytest.mark.parametrize("limits", [True, False])
 @pytest.mark.parametrize("version", [1, 3])
 def test_stop_in_motion_streams_a_jerk_limited_stop_and_says_goodbye(version: int, limits: bool) -> None:
-    rig = Rig(version, {"limits": limits}, STRICT)
+    rig = Rig(version, {**LIMITS, "limits": limits}, STRICT)
     rig.begin()
     rig.run(100, slowly)
     assert np.abs(rig.plant.dq).max() > 0.1
@@ -204,7 +205,7 @@ def test_stop_in_motion_streams_a_jerk_limited_stop_and_says_goodbye(version: in
 
 
 def test_stop_in_motion_with_the_answer_still_owed_answers_first() -> None:
-    rig = Rig(options={"limits": True}, settings=STRICT)
+    rig = Rig(options=LIMITS, settings=STRICT)
     rig.begin()
     rig.run(100, slowly)
     rig.read()  # and then the decision raised
@@ -414,7 +415,7 @@ def test_wrong_options_are_named(options: dict[str, Any], says: str) -> None:
 
 
 def test_the_robots_tables_become_joint_limits_with_room_for_both_conventions_of_j3() -> None:
-    rig = Rig(options={"limits": True})
+    rig = Rig(options=LIMITS)
     limits = rig.driver.configure().limits
     assert limits is not None
     table = np.array([500.0, 500.0, 700.0, 1100.0, 1100.0, 2000.0]) * 0.98
@@ -429,11 +430,11 @@ def test_the_robots_tables_become_joint_limits_with_room_for_both_conventions_of
 
 
 def test_version_1_keeps_room_for_its_rounding() -> None:
-    exact, rounded = (Rig(version, {"limits": True}).driver.configure().limits for version in (2, 1))
+    exact, rounded = (Rig(version, LIMITS).driver.configure().limits for version in (2, 1))
     assert exact is not None and rounded is not None
     jerk = np.degrees(exact.dddq_max - rounded.dddq_max)
     np.testing.assert_allclose(jerk[[0, 3, 4, 5]], 8 * 2.0**-16 / 0.008**3, rtol=1e-5)
-    rig = Rig(1, {"limits": True}, Settings(period_ms=2.0))
+    rig = Rig(1, LIMITS, Settings(period_ms=2.0))
     rig.driver.configure()
     with pytest.raises(HandshakeError, match="too coarsely"):
         rig.driver.activate(2_000_000)
@@ -441,7 +442,7 @@ def test_version_1_keeps_room_for_its_rounding() -> None:
 
 def test_payload_and_flange_speed_choose_the_place_in_the_tables() -> None:
     def acceleration(**options: Any) -> float:
-        limits = Rig(options={"limits": True, **options}).driver.configure().limits
+        limits = Rig(options={**LIMITS, **options}).driver.configure().limits
         assert limits is not None
         return float(np.degrees(limits.ddq_max[0])) / 0.98
 
@@ -452,7 +453,7 @@ def test_payload_and_flange_speed_choose_the_place_in_the_tables() -> None:
 
 @pytest.mark.parametrize("while_started", [True, False])
 def test_a_robot_that_does_not_tell_its_tables_is_refused_if_they_are_asked_for(while_started: bool) -> None:
-    rig = Rig(options={"limits": True}, settings=Settings(thresholds_while_waiting=False))
+    rig = Rig(options=LIMITS, settings=Settings(thresholds_while_waiting=False))
     if while_started:  # some controllers answer only after Start
         rig.wire.to_pc = lambda data: [data] if data[3] != 3 or rig.controller.sequence else []
         rig.controller.program = Program.STOPPED
@@ -465,17 +466,17 @@ def test_a_robot_that_does_not_tell_its_tables_is_refused_if_they_are_asked_for(
 
 @pytest.mark.parametrize(("share", "refused"), [(0.98, False), (1.01, True)])
 def test_a_set_point_beyond_the_tables_is_never_sent(share: float, refused: bool) -> None:
-    rig = Rig(options={"limits": True}, settings=STRICT)
+    rig = Rig(options=LIMITS, settings=STRICT)
     rig.begin()
     rig.run(30)
     before = len(rig.numbers())
     rig.read()
     q = START.copy()
-    q[3] += share * np.radians(4000.0) * 0.008**3
+    q[3] += share * np.radians(5000.0) * 0.008**3  # first stage: the flange rests
     if not refused:
         assert rig.write(q).ok
         return
-    with pytest.raises(ProtocolError, match="MOTN-722.*J4 jerk 4040, the robot's limit is 3980 deg/s3"):
+    with pytest.raises(ProtocolError, match="MOTN-722.*J4 jerk 5050, the robot's limit is 4975 deg/s3 at a"):
         rig.write(q)
     assert len(rig.numbers()) == before
     rig.driver.stop()

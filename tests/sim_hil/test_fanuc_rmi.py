@@ -113,7 +113,7 @@ def robot(tmp_path: Path) -> Iterator[tuple[int, int, subprocess.Popen[str]]]:
 
 def test_a_session_over_udp_and_tcp(robot: tuple[int, int, subprocess.Popen[str]], tmp_path: Path) -> None:
     udp, tcp, process = robot
-    options = {"host": "127.0.0.1", "port": udp, "rmi_port": tcp, "settle": 0.1, "limits": True}
+    options = {"host": "127.0.0.1", "port": udp, "rmi_port": tcp, "settle": 0.1, "limits": True, "arm": "crx_10ia_l"}
     driver = StreamMotionB({**options, "lock_dir": str(tmp_path)})
     limits = driver.configure().limits
     assert limits is not None and np.degrees(limits.ddq_max[0]) == pytest.approx(265 * 0.98, rel=1e-5)
