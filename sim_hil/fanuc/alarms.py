@@ -17,6 +17,7 @@ class Alarm:
         return f"{self.number} {self.text}"
 
 
+UNREACHABLE = Alarm("MOTN-018", "Position not reachable")
 SEQUENCE = Alarm("MOTN-601", "ST: Sequence No. error")
 DRY = Alarm("MOTN-603", "ST: Receiving interval over")
 VERSION = Alarm("MOTN-607", "ST: Protocol version mismatch")

@@ -96,6 +96,8 @@ def from_wire(axes: Array, n: int) -> Array:
     return np.deg2rad(pendant)
 
 
+_NEWTON_STEPS, _NEWTON_ENOUGH, _NEWTON_STRIDE, _NUDGE = 20, 1e-9, 0.2, 1e-6
+
 # Face plate against the flange: its z is the flange's x. DATASHEET
 _FACE_PLATE = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 
@@ -120,6 +122,26 @@ class Arm:
         p = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
         angles = (math.atan2(r[2, 1], r[2, 2]), p, math.atan2(r[1, 0], r[0, 0]))  # R = Rz(R) Ry(P) Rx(W)
         return np.concatenate([1000.0 * place, np.rad2deg(angles), np.zeros(3)])
+
+    def inverse(self, pose: Array, near: Array) -> Array | None:
+        """The joints at which the face plate has `pose` (X Y Z mm, W P R deg), on the branch of `near`; None: there are
+        none, or `near` is too far away. Newton's method, differences for derivatives."""
+        target = _rotation(np.radians(pose[3:6])), 1e-3 * pose[:3]
+        q = near.copy()
+        for _ in range(_NEWTON_STEPS):
+            error = self._miss(q, target)
+            if np.max(np.abs(error)) < _NEWTON_ENOUGH:
+                return q
+            slope = np.column_stack([self._miss(q + row, target) - error for row in _NUDGE * np.eye(len(q))]) / _NUDGE
+            q = q - np.clip(np.linalg.lstsq(slope, error)[0], -_NEWTON_STRIDE, _NEWTON_STRIDE)
+        return None
+
+    def _miss(self, q: Array, target: tuple[Array, Array]) -> Array:
+        """How far off the face plate is: (6,) m and rad."""
+        rotation, place = self._frame(q)
+        turn = target[0].T @ rotation @ _FACE_PLATE
+        off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2.0
+        return np.concatenate([place - target[1], off])
 
     def _frame(self, q: Array) -> tuple[Array, Array]:
         rotation, place = np.eye(3), np.zeros(3)
@@ -157,6 +179,12 @@ CRX_10IA_L = Arm(
     ampere_per_nm=(0.01, 0.01, 0.02, 0.067, 0.067, 0.067),
 )
 ARMS = {"lrmate_200id": LR_MATE_200ID, "crx_10ia_l": CRX_10IA_L}
+
+
+def _rotation(angles: Array) -> Array:
+    """R = Rz(R) Ry(P) Rx(W)."""
+    w, p, r = (float(angle) for angle in angles)
+    return _turn((0, 0, 1), r) @ _turn((0, 1, 0), p) @ _turn((1, 0, 0), w)
 
 
 def _turn(axis: tuple[int, int, int], angle: float) -> Array:

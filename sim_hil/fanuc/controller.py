@@ -135,6 +135,7 @@ class Controller(Cabinet):
         self._finished = False
         self._expected: int | None = None
         self._newest: Array | None = None
+        self._style = wire.JOINT
 
     def _pass_ibgn_end(self) -> None:
         self._enter_ibgn()
@@ -195,19 +196,29 @@ class Controller(Cabinet):
         self._draining = draining
 
     def _command(self, packet: wire.Packet, data: bytes) -> None:
-        q = from_wire(packet.axes("position"), len(self._plant.q))
+        q = self._joints(packet)
         if (rule := self._not_acceptable(packet)) is not None:
             self._offend(rule, data)
+        elif q is None:
+            self._alarm(alarms.UNREACHABLE, data)
         elif (alarm := self._check(packet, q)) is not None:
             self._alarm(alarm, data)
         else:
+            self._style = packet["data_style"]
             if packet["last_data"] and self._newest is not None and np.max(np.abs(q - self._newest)) > _LAST_AT_REST:
                 self._offend("last_data while moving", data)
             self._expected = (packet["sequence"] + 1) % 2**32
             self._newest = q
             self._finished = bool(packet["last_data"])
-            self._queue.append(Command(self._finished, q, packet.axes("position")[: len(q)], data))
+            self._queue.append(Command(self._finished, q, to_wire(q)[: len(q)], data))
             self._signals(packet, data)
+
+    def _joints(self, packet: wire.Packet) -> Array | None:
+        """Of a command; a pose keeps the arm's configuration. None: it cannot be reached so."""
+        position = packet.axes("position")
+        if packet["data_style"] == wire.JOINT:
+            return from_wire(position, len(self._plant.q))
+        return self.arm.inverse(position, self._plant.q if self._newest is None else self._newest)
 
     def _signals(self, packet: wire.Packet, data: bytes) -> None:
         """The read window stays for the statuses to come; a write takes effect at once."""
@@ -224,8 +235,6 @@ class Controller(Cabinet):
     def _not_acceptable(self, packet: wire.Packet) -> str | None:
         if self.program is not Program.WAITING:
             return "command while no program waits for it"
-        if packet["data_style"] == 0:
-            return "Cartesian command: not simulated"
         if self._finished:
             return "command after last_data"
         return None
@@ -235,8 +244,11 @@ class Controller(Cabinet):
         if self._expected is None:
             far = np.max(np.abs(q - self._plant.q)) > math.radians(self.settings.start_threshold_deg)
             return alarms.ABNORMAL if far else None
-        if packet["sequence"] != self._expected:
+        ahead = (packet["sequence"] - self._expected) % 2**32
+        if ahead and not (self.settings.lenient and ahead < 2**31):
             return alarms.SEQUENCE
+        if packet["data_style"] != self._style:  # the real one sees the numbers jump
+            return alarms.LIMITS[self.settings.limit_alarms][0].about("joints and poses in one session")
         return alarms.OVERFLOW if len(self._queue) >= self.settings.capacity else None
 
     def _alarm(self, alarm: Alarm, data: bytes | None = None) -> None:

@@ -31,6 +31,7 @@ class Settings:
     thresholds_while_waiting: bool = True  # some controllers do not answer while IBGN start waits
     limits: bool = False  # set-points are held against the limit tables, as the real controller does
     limit_alarms: int = 720  # or 609: the number of the velocity alarm of the software generation
+    lenient: bool = False  # command numbers may skip ahead, as after the prefill of a well-known sample client
     payload_share: float = 1.0  # set at the controller; 1 = full, which is also what it takes if none is set
     thinning: int = 1  # version 3: while it brakes by itself it sends one status of so many
     tool: int = 0  # number of the tool in the changer at power-on; 0: none

@@ -17,6 +17,7 @@ Table = Mapping[int, tuple[str, np.dtype[np.void]]]  # packet type -> name, fiel
 
 USABLE_VERSIONS = (1, 2, 3)
 STAGES = 20
+CARTESIAN, JOINT = 0, 1  # data_style of a command
 IMPLAUSIBLE = 1e6  # deg or mm: beyond it a number is garbage, such as floats in the wrong byte order
 
 _HEAD = [("type", ">u4"), ("version", ">u4")]
@@ -102,6 +103,8 @@ def read_request(data: bytes) -> Packet:
             raise Malformed(f"last_data is {packet['last_data']}")
         if packet["data_style"] > 1:
             raise Malformed(f"data style {packet['data_style']}")
+        if packet.type == 5 and packet["data_style"] == CARTESIAN:
+            raise Malformed("Cartesian command in double precision")
     if packet.name == "thresholds" and not (1 <= packet["axis"] <= 9 and packet["kind"] <= 2):
         raise Malformed(f"thresholds of axis {packet['axis']}, kind {packet['kind']}")
     return packet

@@ -286,7 +286,7 @@ def test_offences_keep_their_bytes_and_change_nothing() -> None:
     n = bench.sequence
     bad = [
         (b"\0\0\0\7", "malformed packet: 4 bytes"),
-        (bench.command(n, style=0), "Cartesian command"),
+        (bench.command(n, style=0), "malformed packet: Cartesian command in double precision"),
         (wire.write_request("command", 1, sequence=n, data_style=1), "version 1 in a session of version 3"),
     ]
     for data, rule in bad:
