@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from logs.audit_evidence import Evidence, Progress, gather
 from logs.audit_rules import RULES, Finding
 from logs.mcap_scan import CorruptLog
-from logs.reader import Log, open_log
+from logs.recording import Recording, open_recording
 from logs.replay import replay
 
 CHANGES = 400  # changes of mode whose neighbourhood is run again
@@ -40,7 +40,7 @@ def audit(
     LogError: not a recording at all, or not readable.
     """
     try:
-        log = open_log(path)
+        log = open_recording(path)
     except CorruptLog as error:
         return _damaged(path, error), None
     evidence = gather(log, progress)
@@ -64,25 +64,26 @@ def chosen(e: Evidence, sample: int | None) -> Sequence[int]:
     return [int(i) for i in kept]
 
 
-def _report(log: Log, e: Evidence, findings: list[Finding]) -> dict[str, Any]:
+def _report(log: Recording, e: Evidence, findings: list[Finding]) -> dict[str, Any]:
     distance = e.c["outputs.decision.d_measured"]
     named = {finding.name: finding for finding in findings}
     report = {
         "log": log.path.name,
-        "sha256": _sha256(log),
+        "sha256": log.sha256,
+        "parts": [part.path.name for part in log.parts],
         "holds": all(finding.holds for finding in findings),
         "cycles": log.cycles,
         "duration_s": round(float(e.t_s[-1]), 6) if log.cycles else 0.0,
         "sealed": {
             "ok": named["seals"].holds,
-            "bytes": log.seals.sealed_bytes,
-            "final": log.seals.final,
-            "count": log.seals.count,
-            "key": log.seals.public_key,
+            "bytes": sum(part.seals.sealed_bytes for part in log.parts),
+            "final": all(part.seals.final for part in log.parts),
+            "count": sum(part.seals.count for part in log.parts),
+            "key": log.parts[0].seals.public_key,
         },
         "crc_ok": not e.broken_records,
         "complete": named["completeness"].holds and named["closed"].holds,
-        "recovered": log.recovered or None,
+        "recovered": log.parts[-1].recovered or None,
         "gaps": e.notes.get("gaps", []),
         "min_distance_m": _least(distance),
         "worst_phi": named["safety rows"].worst,
@@ -134,7 +135,3 @@ def _plain(finding: Finding) -> dict[str, Any]:
 def _least(values: np.ndarray[Any, Any]) -> float | None:
     finite = values[np.isfinite(values)]
     return round(float(finite.min()), 9) if len(finite) else None
-
-
-def _sha256(log: Log) -> str:
-    return hashlib.sha256(memoryview(log.data)).hexdigest()

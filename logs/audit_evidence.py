@@ -10,7 +10,8 @@ import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from asc_rt.core.types import Mode
-from logs.reader import Log, Records
+from logs.reader import Records
+from logs.recording import Recording
 from logs.replay import ReplayReport
 from logs.summary import STOP_COLUMNS
 from logs.wire import FIELDS as WIRE_FIELDS
@@ -35,7 +36,7 @@ _COLUMNS = tuple({  # each once
 class Evidence:
     """`c`: column by path of the field; derived ones have names without a dot."""
 
-    log: Log
+    log: Recording
     c: dict[str, Column]
     broken_records: int  # whose own checksum is wrong
     trusted: Ed25519PublicKey | None = None  # whose recordings the auditor trusts
@@ -75,7 +76,7 @@ class Evidence:
         return found
 
 
-def gather(log: Log, progress: Progress = iter) -> Evidence:
+def gather(log: Recording, progress: Progress = iter) -> Evidence:
     """LogError: the file."""
     parts: list[dict[str, Column]] = []
     broken, size = 0, log.layout.size

@@ -19,6 +19,7 @@ from asc_rt.core.system import System
 from asc_rt.core.types import CommandKind, EventKind, Health, Mode, Status, StopReason, vector
 from logs import audit_wire, schema, seal
 from logs.audit_evidence import Column, Evidence
+from logs.reader import Log
 from logs.summary import APPROACH_M_S, dropped, stops
 from logs.wire import packets
 
@@ -54,7 +55,11 @@ def _skip(name: str, why: str) -> Finding:
 
 def identity(e: Evidence) -> Finding:
     """The attachments that the session began with are there, unaltered."""
-    told, files = e.log.session, e.log.attachments
+    return _each_part(e, "identity", _part_identity)
+
+
+def _part_identity(part: Log) -> Finding:
+    told, files = part.session, part.attachments
     promised = {key.removeprefix("sha256 "): value for key, value in told.items() if key.startswith("sha256 ")}
     wrong = [name for name, value in promised.items() if hashlib.sha256(files.get(name, b"")).hexdigest() != value]
     who = ", ".join(f"{key} {told.get(key, 'unknown')}" for key in ("cell", "git_commit", "operator", "started"))
@@ -65,12 +70,16 @@ def identity(e: Evidence) -> Finding:
 
 def seals(e: Evidence) -> Finding:
     """Seals hold (the reader has checked each), reach to the end, and are of a key that the auditor trusts."""
-    s, name = e.log.seals, "seals"
+    return _each_part(e, "seals", lambda part: _part_seals(e, part))
+
+
+def _part_seals(e: Evidence, part: Log) -> Finding:
+    s, name = part.seals, "seals"
     if not s.public_key:
         return Finding(name, False, "the session was not sealed: nothing shows that it is unaltered")
     if not s.count:
         return Finding(name, False, "the session should be sealed, and has no seal")
-    whole, key = e.log.extent.data_bytes, seal.key_id(s.public_key)
+    whole, key = part.extent.data_bytes, seal.key_id(s.public_key)
     detail = f"{s.count} seals hold, to byte {s.sealed_bytes} of {whole}, key {key}"
     if e.trusted is None:
         return Finding(name, True, f"{detail}; whose key it is was not said (--public-key)")
@@ -80,24 +89,42 @@ def seals(e: Evidence) -> Finding:
     return Finding(name, True, f"{detail}, as {e.trusted_name}{rest}")
 
 
+def _each_part(e: Evidence, name: str, judge: Callable[[Log], Finding]) -> Finding:
+    """The verdict on a session of several files: each must hold, and each is named."""
+    found = [judge(part) for part in e.log.parts]
+    if len(found) == 1:
+        return found[0]
+    detail = "; ".join(f"part {i}: {finding.detail}" for i, finding in enumerate(found, 1))
+    holds, skipped = all(finding.holds for finding in found), all(finding.skipped for finding in found)
+    return Finding(name, holds, detail, skipped)
+
+
 def signature(e: Evidence) -> Finding:
     """The detached signature, if there is one, is of this file as it is."""
-    holds = seal.check_file(e.log.path, e.log.seals.public_key) if e.log.seals.public_key else None
+    return _each_part(e, "signature", _part_signature)
+
+
+def _part_signature(part: Log) -> Finding:
+    holds = seal.check_file(part.path, part.seals.public_key) if part.seals.public_key else None
     if holds is None:
-        return _skip("signature", f"there is no {seal.signature_path(e.log.path).name}")
+        return _skip("signature", f"there is no {seal.signature_path(part.path).name}")
     return Finding("signature", holds, "over every byte" if holds else "does not belong to this file")
 
 
 def closed(e: Evidence) -> Finding:
     """The file was closed by the logger, or afterwards by `asc recover`."""
-    if e.log.truncated:
-        left = len(e.log.data) - e.log.extent.complete_bytes
+    return _each_part(e, "closed", _part_closed)
+
+
+def _part_closed(part: Log) -> Finding:
+    if part.truncated:
+        left = len(part.data) - part.extent.complete_bytes
         return Finding("closed", False, f"not closed, {left} bytes behind the last whole record; run asc recover")
-    if e.log.recovered:
-        told = e.log.recovered
+    if part.recovered:
+        told = part.recovered
         added = f", {told['cycles_from_ring']} cycles from the ring" if told["cycles_from_ring"] != "0" else ""
         return Finding("closed", True, f"recovered, {told['bytes_cut']} bytes cut{added}")
-    return Finding("closed", True, f"by the logger: {e.log.end.get('reason', 'unknown')}")
+    return Finding("closed", True, f"by the logger: {part.end.get('reason', 'unknown')}")
 
 
 def records(e: Evidence) -> Finding:

@@ -170,11 +170,11 @@ def verdict(report: dict[str, Any]) -> list[str]:
 def _what_if(path: Path, overrides: list[str], as_json: bool, show: Show) -> None:
     """Exit code 0: a difference is what was asked for."""
     from asc_rt.config import what_if as changed
-    from logs.reader import open_log
+    from logs.recording import open_recording
     from logs.replay import core_stepper
     from logs.whatif import what_if
 
-    log = open_log(path)
+    log = open_recording(path)
     params = changed(log.params, overrides) if overrides else log.params
     found = what_if(log, core_stepper(params), params, progress=_bar())
     first = found.first

@@ -23,7 +23,7 @@ from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs
 from asc_rt.fingerprint import fingerprint
 from asc_rt.fixed_protobuf import RecordError
 from logs.diff import Difference, altered, differences
-from logs.reader import Log, open_log
+from logs.recording import Recording, open_recording
 from logs.wire import FIELDS, Column, replay_wire
 
 Stepper = Callable[[CoreState, CycleInputs], tuple[CoreState, CycleOutputs]]
@@ -98,7 +98,7 @@ class _Found:
 
 
 def replay(
-    recording: str | Path | Log,
+    recording: str | Path | Recording,
     start: int = 0,
     order: Order = Order.FORWARD,
     *,
@@ -113,7 +113,7 @@ def replay(
 
     LogError: the file. IndexError: fewer records than `start`.
     """
-    log = recording if isinstance(recording, Log) else open_log(recording)
+    log = recording if isinstance(recording, Recording) else open_recording(recording)
     if not 0 <= start < max(log.cycles, 1):
         raise IndexError(f"cycle {start}: the log has {log.cycles}")
     numbers: Sequence[int] = range(start, log.cycles) if cycles is None else cycles
@@ -134,7 +134,7 @@ def replay(
     )  # fmt: skip
 
 
-def _replay_part(log: Log, again: Stepper, numbers: Iterable[int], tolerance: float) -> _Found:
+def _replay_part(log: Recording, again: Stepper, numbers: Iterable[int], tolerance: float) -> _Found:
     total = _Found()
     for index in numbers:
         total.count += 1
@@ -173,12 +173,12 @@ def _replay_shared(
                 next(counted, None)
 
 
-_worker: tuple[Log, Stepper] | None = None  # of this process
+_worker: tuple[Recording, Stepper] | None = None  # of this process
 
 
 def _begin_worker(path: str, stepper: Callable[[Params], Stepper]) -> None:
     global _worker
-    log = open_log(path)
+    log = open_recording(path)
     _worker = log, stepper(log.params)
 
 
@@ -188,7 +188,7 @@ def _worker_part(numbers: Sequence[int], tolerance: float) -> _Found:
     return _replay_part(log, again, numbers, tolerance)
 
 
-def compare(log: Log, index: int, again: Stepper) -> list[Difference]:
+def compare(log: Recording, index: int, again: Stepper) -> list[Difference]:
     """All that differs in one cycle: the record itself if it was altered, its outputs, and the state after it."""
     layout, record = log.layout, log.record(index)
     found = [change] if (change := altered(layout, record)) else []
@@ -207,7 +207,7 @@ def compare(log: Log, index: int, again: Stepper) -> list[Difference]:
     return found
 
 
-def _next(log: Log, index: int, after: CoreState) -> bytes | None:
+def _next(log: Recording, index: int, after: CoreState) -> bytes | None:
     """The record whose state must be `after`; None: it is missing, or was altered, which is told as its own fault."""
     if index + 1 >= log.cycles or _tick(log, index + 1) != after.tick:
         return None
@@ -219,6 +219,6 @@ def _of_next(found: Difference) -> Difference:
     return found._replace(field=found.field.replace("state.", "state_after.", 1))
 
 
-def _tick(log: Log, index: int) -> int:
+def _tick(log: Recording, index: int) -> int:
     offset = log.layout.dtype.fields["inputs.tick"][1]  # type: ignore[index]
     return int.from_bytes(log.record(index)[offset : offset + 8], "little", signed=True)

@@ -37,7 +37,7 @@ class SessionFiles:
 
     def _open(self) -> LogFile:
         number = len(self._parts) + 1
-        path = self._path if number == 1 else self._path.with_name(f"{self._path.stem}.part{number}.mcap")
+        path = self._path if number == 1 else part_path(self._path, number)
         own = {"part": str(number)}
         if self._parts:
             own |= {"recording": self._parts[0]["session_id"], "previous_sha256": self._parts[-1]["sha256"]}
@@ -87,6 +87,11 @@ class SessionFiles:
         made = path.with_suffix(".new")
         made.write_text(json.dumps({"parts": self._parts}, indent=1) + "\n")
         os.replace(made, path)
+
+
+def part_path(first: Path, number: int) -> Path:
+    """The file of part `number`, 2 and on, of the session that begins in `first`."""
+    return first.with_name(f"{first.stem}.part{number}.mcap")
 
 
 def manifest_path(first: Path) -> Path:

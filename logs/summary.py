@@ -11,7 +11,8 @@ import numpy as np
 
 from asc_rt.core.types import Mode, Status, StopReason
 from logs import schema
-from logs.reader import Log, LogError, open_log
+from logs.mcap_scan import LogError
+from logs.recording import Recording, open_recording
 
 APPROACH_M_S = 0.01  # ASSUMED: slower is the servo's trembling about its set-point, not the robot coming closer
 
@@ -33,7 +34,7 @@ _COLUMNS = (
 
 def summarise(path: str | Path) -> dict[str, Any]:
     """JSON-able; None where the log cannot tell. LogError: the file."""
-    log = open_log(path)
+    log = open_recording(path)
     c = log.columns(*_COLUMNS)
     truth = _Truth(log)
     truth_distance = truth.distance[np.isfinite(truth.distance)]
@@ -94,7 +95,7 @@ def exit_reason(c: dict[str, Column]) -> str:
     return StopReason(int(c["outputs.decision.reason"][-1])).name if ended else "UNFINISHED"
 
 
-def dropped(log: Log, tick: Column) -> int:
+def dropped(log: Recording, tick: Column) -> int:
     """Cycles that were run and are not in the log: what the logger counted, and what the ticks show."""
     counted = [json.loads(message.data)["cycle"] for message in log.messages(schema.DROPOUT.topic)]
     missing = int(tick[-1] - tick[0]) + 1 - len(tick) if len(tick) else 0
@@ -130,7 +131,7 @@ def _percentiles(ns: Column) -> dict[str, float | None]:
 class _Truth:
     """What the simulated plant says really happened; empty for a real robot."""
 
-    def __init__(self, log: Log) -> None:
+    def __init__(self, log: Recording) -> None:
         try:
             rows = [json.loads(message.data) for message in log.messages(schema.TRUTH.topic)]
             far = math.inf

@@ -20,7 +20,8 @@ import rerun as rr
 from tqdm import tqdm
 
 from logs import schema
-from logs.reader import Log, LogError, open_log
+from logs.mcap_scan import LogError
+from logs.recording import Recording, open_recording
 from logs.view_columns import Canvas, in_blocks, new_recording
 from logs.view_events import Chronicle, Event, draw_events, draw_near_misses, ending, focus, nearest_moments
 from logs.view_layout import TRUE_DISTANCE, WINDOW_S, layout
@@ -37,7 +38,7 @@ def view(
 ) -> None:
     """Show the recording `path`. `at`: moment of the picture, s since the start; default: when robot and person were
     nearest. LogError: the file; ViewError: it cannot be shown here, or there is nothing to show."""
-    log = open_log(path)
+    log = open_recording(path)
     start_ns, end_ns = _extent(log)
     if at is not None and shot is None:
         raise ViewError("--at S is the moment of a picture: it needs --shot FILE.png")
@@ -52,7 +53,7 @@ def view(
         _show(log, moment_ns, web)
 
 
-def write_rrd(log: Log, path: Path, moment_ns: int, picture: bool = False) -> None:
+def write_rrd(log: Recording, path: Path, moment_ns: int, picture: bool = False) -> None:
     """The whole recording with its layout, as the viewer's own file. `moment_ns`: what the eye is set up for, on the
     clock of the record. `picture`: without menus. ViewError: no cycles in it."""
     start_ns, end_ns = _extent(log)
@@ -79,7 +80,7 @@ def write_rrd(log: Log, path: Path, moment_ns: int, picture: bool = False) -> No
     recording.disconnect()
 
 
-def _draw_truth(canvas: Canvas, log: Log, start_ns: int, end_ns: int) -> None:
+def _draw_truth(canvas: Canvas, log: Recording, start_ns: int, end_ns: int) -> None:
     """The distance in the simulator's physics, beside what the controller believed."""
     try:
         rows = [json.loads(message.data) for message in log.messages(schema.TRUTH.topic)]
@@ -93,7 +94,7 @@ def _draw_truth(canvas: Canvas, log: Log, start_ns: int, end_ns: int) -> None:
         canvas.recording.send_columns(TRUE_DISTANCE, [canvas.time(t_ns[within])], columns)
 
 
-def _extent(log: Log) -> tuple[int, int]:
+def _extent(log: Recording) -> tuple[int, int]:
     """Monotonic ns of the first and the last cycle."""
     if log.cycles < 2:
         raise ViewError(f"{log.path}: nothing to show: {log.cycles or 'no'} cycles in it")
@@ -102,14 +103,14 @@ def _extent(log: Log) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _shoot(log: Log, path: Path, moment_ns: int) -> None:
+def _shoot(log: Recording, path: Path, moment_ns: int) -> None:
     with tempfile.TemporaryDirectory(prefix="asc-view-") as folder:
         rrd = Path(folder, f"{log.path.stem}.rrd")
         write_rrd(log, rrd, moment_ns, picture=True)
         path.write_bytes(screenshot(rrd, moment_ns - _extent(log)[0]))
 
 
-def _show(log: Log, moment_ns: int, web: bool) -> None:
+def _show(log: Recording, moment_ns: int, web: bool) -> None:
     """In a window or for a browser, until it is closed or Ctrl-C."""
     port = free_port()
     if not web:

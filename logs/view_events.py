@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from asc_rt.core.types import EventKind, Health, Mode, Status, StopReason
-from logs.reader import Log
+from logs.recording import Recording
 from logs.summary import exit_reason
 from logs.view_columns import DECISION, HUMAN, Array, Canvas, Records
 from logs.view_layout import NEAR_MISSES
@@ -81,7 +81,7 @@ def changes(now: Records, following: Records) -> list[Event]:
     return found
 
 
-def ending(log: Log, t_ns: int) -> Event:
+def ending(log: Recording, t_ns: int) -> Event:
     """How the session ended, at its last cycle."""
     names = (f"{DECISION}.reason", "state.mode", "outputs.stop.present", "outputs.command.present")
     reason = exit_reason(log.columns(*names, "outputs.command.is_last"))
@@ -110,7 +110,7 @@ class Focus(NamedTuple):
     towards: float  # rad from the base's x axis: where the person was
 
 
-def nearest_moments(log: Log) -> Nearest:
+def nearest_moments(log: Recording) -> Nearest:
     """Every near miss while the robot was live (armed or braking). LogError: the file."""
     c = log.columns("inputs.t_ns", "state.mode", f"{DECISION}.d_measured")
     t_ns, d = c["inputs.t_ns"], c[f"{DECISION}.d_measured"]
@@ -121,7 +121,7 @@ def nearest_moments(log: Log) -> Nearest:
     return Nearest(t_ns[at], d[at], int(t_ns[d.argmin()]))
 
 
-def focus(log: Log, moment_ns: int, window_ns: int) -> Focus:
+def focus(log: Recording, moment_ns: int, window_ns: int) -> Focus:
     """`moment_ns`: on the clock of the record."""
     c = log.columns("inputs.t_ns", f"{DECISION}.u_ref", f"{DECISION}.u_safe")
     around = np.abs(c["inputs.t_ns"] - moment_ns) <= window_ns

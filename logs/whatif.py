@@ -20,7 +20,8 @@ from asc_rt.core.params import Params
 from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs, Vector, vector
 from asc_rt.fixed_protobuf import Leaf
 from logs.diff import differences
-from logs.reader import Log, Records
+from logs.reader import Records
+from logs.recording import Recording
 from logs.summary import STOP_COLUMNS, stops
 
 Stepper = Callable[[CoreState, CycleInputs], tuple[CoreState, CycleOutputs]]
@@ -57,7 +58,7 @@ class WhatIf:
         return found
 
 
-def what_if(log: Log, again: Stepper, params: Params, progress: Progress = iter) -> WhatIf:
+def what_if(log: Recording, again: Stepper, params: Params, progress: Progress = iter) -> WhatIf:
     """Run the whole log anew with the decision `again`, made of `params`."""
     found = WhatIf()
     kept: list[tuple[dict[str, Column], dict[str, Column]]] = []
@@ -71,7 +72,9 @@ def what_if(log: Log, again: Stepper, params: Params, progress: Progress = iter)
     return found
 
 
-def _run(found: WhatIf, log: Log, again: Stepper, params: Params, progress: Progress) -> Iterator[tuple[bytes, bytes]]:
+def _run(
+    found: WhatIf, log: Recording, again: Stepper, params: Params, progress: Progress
+) -> Iterator[tuple[bytes, bytes]]:
     """Pairs of records: as logged, and as it would be now."""
     delay = max(1, round(params.robot.command_latency_ns / params.period_ns))
     shifts: deque[Vector] = deque(maxlen=delay)  # by how much the set-points differ, oldest first
@@ -99,7 +102,7 @@ def _run(found: WhatIf, log: Log, again: Stepper, params: Params, progress: Prog
             return
 
 
-def _blocks(log: Log, pairs: Iterator[tuple[bytes, bytes]]) -> Iterator[tuple[Records, Records]]:
+def _blocks(log: Recording, pairs: Iterator[tuple[bytes, bytes]]) -> Iterator[tuple[Records, Records]]:
     while block := [pair for _, pair in zip(range(BLOCK), pairs, strict=False)]:
         logged, replayed = (np.frombuffer(b"".join(side), log.layout.dtype) for side in zip(*block, strict=True))
         yield logged, replayed
@@ -108,7 +111,7 @@ def _blocks(log: Log, pairs: Iterator[tuple[bytes, bytes]]) -> Iterator[tuple[Re
 # --- what differs ----------------------------------------------------------------------------------------------------
 
 
-def _compare(found: WhatIf, log: Log, logged: Records, replayed: Records) -> None:
+def _compare(found: WhatIf, log: Recording, logged: Records, replayed: Records) -> None:
     """Add the differences of a block to `found`."""
     differs = np.zeros(len(logged), bool)
     for leaf in log.layout.leaves:

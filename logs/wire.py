@@ -17,7 +17,7 @@ import numpy as np
 from drivers import registry
 from drivers.base import DriverError, ReplayCodec
 from logs import schema
-from logs.reader import Log
+from logs.recording import Recording
 
 Column = np.ndarray[Any, Any]
 
@@ -38,7 +38,9 @@ class WireReport:
     first: str  # the first of them, in words
 
 
-def replay_wire(log: Log, columns: dict[str, Column] | None = None, decode: Sequence[int] | None = None) -> WireReport:
+def replay_wire(
+    log: Recording, columns: dict[str, Column] | None = None, decode: Sequence[int] | None = None
+) -> WireReport:
     """`columns`: FIELDS of all cycles, if they are at hand. `decode`: cycles that go through the codec; None: all.
 
     LogError: the file.
@@ -74,7 +76,7 @@ def _among(times: Column, packets: dict[int, bytes]) -> Column:
     return found
 
 
-def codec_of(log: Log) -> ReplayCodec | None:
+def codec_of(log: Recording) -> ReplayCodec | None:
     """The codec of the driver that the session had."""
     try:
         table = json.loads(log.session.get("driver", "{}"))
@@ -85,7 +87,7 @@ def codec_of(log: Log) -> ReplayCodec | None:
 
 
 @functools.lru_cache(1)
-def packets(log: Log) -> tuple[dict[int, bytes], dict[int, bytes]]:
+def packets(log: Recording) -> tuple[dict[int, bytes], dict[int, bytes]]:
     """Received and sent: time -> bytes."""
     found: dict[str, dict[int, bytes]] = {schema.WIRE_RX.topic: {}, schema.WIRE_TX.topic: {}}
     for message in log.messages(*found):

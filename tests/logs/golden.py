@@ -35,7 +35,7 @@ from logs.commands import told
 from logs.context import attachments, session
 from logs.log_file import LogFile
 from logs.mcap_scan import LogError
-from logs.reader import open_log
+from logs.recording import open_recording
 from logs.replay import core_stepper
 from logs.whatif import what_if
 
@@ -112,7 +112,7 @@ def play(params: Params) -> list[tuple[object, ...]]:
 
 def difference(path: Path = GOLDEN) -> list[str]:
     """How today's code behaves differently, in words."""
-    log = open_log(path)
+    log = open_recording(path)
     return told(what_if(log, core_stepper(log.params), log.params).as_dict())
 
 

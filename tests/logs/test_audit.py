@@ -18,7 +18,7 @@ from logs.audit import audit, chosen, with_hash
 from logs.audit_evidence import Evidence, gather
 from logs.commands import verdict
 from logs.mcap_scan import LogError
-from logs.reader import open_log
+from logs.recording import open_recording
 from logs.recover import recover
 from logs.replay import FirstDifference, replay
 from logs.report import Picture, html_report, moments
@@ -33,7 +33,7 @@ def session(core_session: tuple[Path, list[Any]]) -> Path:
 
 @pytest.fixture
 def evidence(session: Path) -> Evidence:
-    return gather(open_log(session))
+    return gather(open_recording(session))
 
 
 def test_a_good_session_keeps_every_rule(session: Path) -> None:
@@ -68,19 +68,19 @@ def active(e: Evidence) -> int:
 
 
 def still_other(e: Evidence) -> None:
-    e.log.attachments["cell.toml"] = b"other"
+    e.log.parts[0].attachments["cell.toml"] = b"other"
 
 
 def gone(e: Evidence) -> None:
-    del e.log.attachments["cell.toml"]
+    del e.log.parts[0].attachments["cell.toml"]
 
 
 def no_key(e: Evidence) -> None:
-    e.log.seals.public_key = ""
+    e.log.parts[0].seals.public_key = ""
 
 
 def no_seal(e: Evidence) -> None:
-    e.log.seals.count = 0
+    e.log.parts[0].seals.count = 0
 
 
 def other_key(e: Evidence) -> None:
@@ -92,7 +92,7 @@ def other_file(e: Evidence) -> None:
 
 
 def not_closed(e: Evidence) -> None:
-    e.log.extent.closed = False
+    e.log.parts[0].extent.closed = False
 
 
 def altered(e: Evidence) -> None:
@@ -230,7 +230,7 @@ def test_what_is_wrong_breaks_its_rule(evidence: Evidence, rule: rules.Rule, spo
 
 
 def test_what_was_attached_later_is_named(evidence: Evidence) -> None:
-    evidence.log.attachments["later.json"] = b"{}"
+    evidence.log.parts[0].attachments["later.json"] = b"{}"
     found = rules.identity(evidence)
     assert found.holds
     assert found.detail.endswith("later later.json")
@@ -271,7 +271,7 @@ def test_sent_bytes_are_decoded_independently(wire_session: Callable[..., Path],
             changed[byte if byte > 0 else 33] ^= 0x40
             packets[7] = (channel, t_ns, bytes(changed))
 
-    found = rules.wire_bytes(gather(open_log(wire_session(spoil))))
+    found = rules.wire_bytes(gather(open_recording(wire_session(spoil))))
     assert found.holds == (byte is None)
     assert not found.skipped
 
@@ -297,8 +297,8 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_recovered_file_passes_and_says_so(session: Path, tmp_path: Path) -> None:
-    whole = open_log(session)
-    place = whole._chunks[-2].raw.end + 30  # in the index behind it
+    whole = open_recording(session)
+    place = whole.parts[0]._chunks[-2].raw.end + 30  # in the index behind it
     session.write_bytes(session.read_bytes()[:place])
     broken = audit(session, sample=5)[0]
     assert [rule["name"] for rule in broken["rules"] if not rule["holds"]] == ["signature", "closed"]

@@ -19,10 +19,13 @@ from asc_rt import ring
 from asc_rt.bus import open_router
 from asc_rt.topics import STATE
 from logs import mcap_writer
+from logs.audit import audit
 from logs.context import attachments, session
+from logs.mcap_scan import CorruptLog
 from logs.reader import open_log
+from logs.recording import open_recording
 from logs.recover import recover
-from logs.session_files import SessionFiles, manifest_path
+from logs.session_files import SessionFiles, manifest_path, part_path
 from logs.writer import FLUSH_NS, Logger
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
@@ -175,6 +178,66 @@ def test_rotation_makes_whole_files_and_a_manifest(make: Callable[..., Bench]) -
     assert found == bench.packed
     assert told[0]["reason"] == "rotated"
     assert told[-1]["reason"] == "session closed"
+
+
+@pytest.fixture
+def rotated(make: Callable[..., Bench]) -> Bench:
+    bench = make(rotate_ns=20 * FLUSH_NS)
+    bench.put(0, 60)
+    bench.logger.finish("session closed")
+    return bench
+
+
+def test_a_rotated_session_is_read_as_one(rotated: Bench, tmp_path: Path) -> None:
+    link = tmp_path / "latest.mcap"
+    link.symlink_to(rotated.out.name)
+    for path in (rotated.out, link):
+        whole = open_recording(path)
+        assert len(whole.parts) == len(json.loads(manifest_path(rotated.out).read_text())["parts"]) > 2
+        assert [whole.record(i) for i in range(whole.cycles)] == rotated.packed
+        assert b"".join(batch.tobytes() for batch in whole.batches()) == b"".join(rotated.packed)
+        assert list(whole.columns("inputs.tick")["inputs.tick"]) == list(range(60))
+        assert whole.end["reason"] == "session closed" and not whole.truncated
+        with pytest.raises(IndexError):
+            whole.record(60)
+    alone = open_recording(part_path(rotated.out, 2))
+    assert len(alone.parts) == 1 and alone.cycles < 60
+    report, _ = audit(rotated.out, sample=1)
+    named = {rule["name"]: rule for rule in report["rules"]}
+    assert report["cycles"] == 60 and report["parts"][1] == "a.part2.mcap" and not report["gaps"]
+    for name in ("identity", "seals", "closed", "completeness"):
+        assert named[name]["holds"], named[name]
+    assert "part 3: " in named["seals"]["detail"]
+
+
+def test_a_part_that_is_missing_exchanged_or_altered_is_seen(rotated: Bench, tmp_path: Path) -> None:
+    second, third = part_path(rotated.out, 2), part_path(rotated.out, 3)
+    kept = second.read_bytes(), third.read_bytes()
+    third.rename(tmp_path / "away")
+    with pytest.raises(CorruptLog, match=r"incomplete: a\.part3\.mcap.* are not beside it"):
+        open_recording(rotated.out)
+    second.write_bytes(kept[1])
+    with pytest.raises(CorruptLog, match=r"a\.mcap: altered: a\.part2\.mcap names another SHA-256"):
+        open_recording(rotated.out)
+    second.unlink()
+    with pytest.raises(CorruptLog, match="incomplete"):
+        open_recording(rotated.out)
+    second.write_bytes(kept[0])
+    third.write_bytes(kept[1])
+    assert open_recording(rotated.out).cycles == 60
+
+
+def test_a_part_of_another_session_is_refused(rotated: Bench, recording: Any, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    files = attachments(recording.cell), session(recording.cell)
+    stranger = SessionFiles(other / "a.mcap", *files, KEY, 1, clock=lambda: 0)
+    stranger.close({"reason": "rotated"})
+    stranger.log = stranger._open()
+    stranger.close({"reason": "session closed"})
+    part_path(rotated.out, 2).write_bytes(part_path(other / "a.mcap", 2).read_bytes())
+    with pytest.raises(CorruptLog, match=r"a\.part2\.mcap: is no part of the session in a\.mcap"):
+        open_recording(rotated.out)
 
 
 def test_one_file_needs_no_manifest(make: Callable[..., Bench]) -> None:

@@ -7,7 +7,7 @@ from types import ModuleType
 import pytest
 
 from asc_rt.core.types import StopReason
-from logs.reader import open_log
+from logs.recording import open_recording
 from logs.replay import replay
 from logs.summary import STOP_COLUMNS, exit_reason, stops
 
@@ -35,7 +35,7 @@ def test_the_story_is_told_and_small_enough_to_keep(golden: ModuleType, tmp_path
     path = tmp_path / "new.mcap"
     golden.make(path)
     assert path.stat().st_size < 300_000
-    c = open_log(path).columns(*STOP_COLUMNS)
+    c = open_recording(path).columns(*STOP_COLUMNS)
     assert [stop["reason"] for stop in stops(c)] == [StopReason.HUMAN_STALE.name]
     assert exit_reason(c) == StopReason.SESSION_END.name
     assert golden.difference(path) == [f"{len(c['inputs.tick'])} cycles, nothing differs"]

@@ -14,7 +14,7 @@ from asc_rt.core.types import (
     Status,
 )
 from logs.commands import told
-from logs.reader import open_log
+from logs.recording import open_recording
 from logs.replay import Order, core_stepper, replay
 from logs.whatif import _stop_changes, what_if
 
@@ -37,7 +37,7 @@ def with_d_min(params: Params, d_min: float) -> Params:
 
 
 def test_what_if_nothing_changes_then_nothing_differs(core_session: tuple[Path, list[Any]]) -> None:
-    log = open_log(core_session[0])
+    log = open_recording(core_session[0])
     found = what_if(log, core_stepper(log.params), log.params)
     assert (found.cycles, found.differing, found.first, found.ended) == (150, 0, None, "")
     assert found.waveforms == {}
@@ -45,7 +45,7 @@ def test_what_if_nothing_changes_then_nothing_differs(core_session: tuple[Path, 
 
 
 def test_what_if_the_distance_were_another(core_session: tuple[Path, list[Any]]) -> None:
-    log = open_log(core_session[0])
+    log = open_recording(core_session[0])
     params = with_d_min(log.params, 0.2)
     found = what_if(log, core_stepper(params), params)
     assert found.first is not None
@@ -59,7 +59,7 @@ def test_what_if_the_distance_were_another(core_session: tuple[Path, list[Any]])
 
 def test_what_if_goes_on_from_its_own_state(core_session: tuple[Path, list[Any]]) -> None:
     """A change of one cycle reaches the later ones, which a replay must not show."""
-    log = open_log(core_session[0])
+    log = open_recording(core_session[0])
     decide = core_stepper(log.params)
 
     def nudged(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
@@ -71,7 +71,7 @@ def test_what_if_goes_on_from_its_own_state(core_session: tuple[Path, list[Any]]
 
 
 def test_code_that_raises_ends_the_what_if_and_says_where(core_session: tuple[Path, list[Any]]) -> None:
-    log = open_log(core_session[0])
+    log = open_recording(core_session[0])
     decide = core_stepper(log.params)
 
     def broken(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:

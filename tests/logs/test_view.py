@@ -16,7 +16,9 @@ from asc_rt.core import robot_model
 from asc_rt.core.abstraction import separation
 from asc_rt.core.people import predict
 from asc_rt.core.types import HumanState, Mode, Pairs, Status, StopReason, vector
-from logs.reader import LogError, open_log, records
+from logs.mcap_scan import LogError
+from logs.reader import records
+from logs.recording import open_recording
 from logs.view import view, write_rrd
 from logs.view_columns import Canvas, in_blocks, new_recording
 from logs.view_events import Event, changes, draw_near_misses, nearest_moments
@@ -39,7 +41,7 @@ def with_decision(outputs: Any, **changed: Any) -> Any:
 
 
 def rrd_of(recording: Any, tmp_path: Path, cycles: list[Any], **options: Any) -> Path:
-    log = open_log(recording.write(recording.packed(cycles), **options))
+    log = open_recording(recording.write(recording.packed(cycles), **options))
     path = tmp_path / "out.rrd"
     write_rrd(log, path, nearest_moments(log).worst_ns)
     return path
@@ -265,7 +267,7 @@ def dated(recording: Any, distance: list[float], mode: Mode = Mode.ACTIVE) -> li
 
 def test_every_near_miss_is_found_at_its_least_distance(recording: Any, tmp_path: Path) -> None:
     distance = [0.5, 0.19, 0.15, 0.18, 0.5, 0.5, 0.5, 0.5, 0.12, 0.08, 0.5, np.inf]
-    log = open_log(recording.write(recording.packed(dated(recording, distance))))
+    log = open_recording(recording.write(recording.packed(dated(recording, distance))))
     found = nearest_moments(log)
     start_ns = int(log.columns("inputs.t_ns")["inputs.t_ns"][0])
     assert found.distance.tolist() == [0.15, 0.08]
@@ -278,7 +280,7 @@ def test_every_near_miss_is_found_at_its_least_distance(recording: Any, tmp_path
 
 
 def test_a_robot_that_holds_has_no_near_miss(recording: Any) -> None:
-    log = open_log(recording.write(recording.packed(dated(recording, [0.5, 0.1, 0.5], Mode.HOLD))))
+    log = open_recording(recording.write(recording.packed(dated(recording, [0.5, 0.1, 0.5], Mode.HOLD))))
     assert len(nearest_moments(log).t_ns) == 0
 
 

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from logs import schema
-from logs.reader import open_log
+from logs.recording import open_recording
 from logs.wire import codec_of, replay_wire
 
 Packets = list[tuple[schema.Channel, int, bytes]]
 
 
 def test_true_packets_match(wire_session: Callable[..., Path]) -> None:
-    report = replay_wire(open_log(wire_session()))
+    report = replay_wire(open_recording(wire_session()))
     assert (report.packets, report.decoded, report.mismatches, report.first) == (24, True, 0, "")
 
 
@@ -42,7 +42,7 @@ def test_one_changed_bit_is_a_mismatch(wire_session: Callable[..., Path], which:
         channel, t_ns, data = packets[which]
         packets[which] = (channel, t_ns, flipped(data, byte))
 
-    report = replay_wire(open_log(wire_session(spoil)))
+    report = replay_wire(open_recording(wire_session(spoil)))
     assert report.mismatches == 1
     assert report.first.startswith("cycle 3: ")
     assert any(word in report.first for word in words.split("|"))
@@ -50,7 +50,7 @@ def test_one_changed_bit_is_a_mismatch(wire_session: Callable[..., Path], which:
 
 @pytest.mark.parametrize("which", [6, 7])
 def test_a_missing_packet_is_a_mismatch(wire_session: Callable[..., Path], which: int) -> None:
-    assert replay_wire(open_log(wire_session(lambda packets: packets.pop(which)))).mismatches == 1
+    assert replay_wire(open_recording(wire_session(lambda packets: packets.pop(which)))).mismatches == 1
 
 
 def test_a_driver_without_a_codec_is_checked_for_presence_only(
@@ -61,12 +61,12 @@ def test_a_driver_without_a_codec_is_checked_for_presence_only(
     def spoil(packets: Packets) -> None:
         packets[:] = [(channel, t_ns, b"x") for channel, t_ns, _ in packets]
 
-    report = replay_wire(open_log(wire_session(spoil, cell)))
+    report = replay_wire(open_recording(wire_session(spoil, cell)))
     assert (report.decoded, report.mismatches) == (False, 0)
 
 
 @pytest.mark.parametrize("driver", ["{}", "no json", '{"name": "gone"}', '{"name": "fanuc-j519"}', "[1]"])
 def test_a_driver_that_cannot_be_made_has_no_codec(recording: Any, driver: str) -> None:
-    log = open_log(recording.write(recording.packed(recording.cycles(3))))
-    log.metadata[schema.SESSION]["driver"] = driver
+    log = open_recording(recording.write(recording.packed(recording.cycles(3))))
+    log.session["driver"] = driver
     assert codec_of(log) is None
