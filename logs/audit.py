@@ -17,7 +17,8 @@ import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from logs.audit_evidence import Evidence, Progress, gather
-from logs.audit_rules import RULES, Finding
+from logs.audit_finding import Finding
+from logs.audit_rules import RULES
 from logs.mcap_scan import CorruptLog
 from logs.recording import Recording, open_recording
 from logs.replay import replay

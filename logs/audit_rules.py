@@ -7,20 +7,18 @@ geometry of capsules, in `separation`).
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from asc_rt.core.rows import nearest_measured
 from asc_rt.core.system import System
 from asc_rt.core.types import CommandKind, EventKind, Health, Mode, Status, StopReason, vector
-from logs import audit_wire, schema, seal
+from logs import audit_wire, schema
 from logs.audit_evidence import Column, Evidence
-from logs.reader import Log
-from logs.summary import APPROACH_M_S, dropped, stops
+from logs.audit_files import closed, completeness, identity, records, seals, signature
+from logs.audit_finding import Finding, Rule, skip
+from logs.summary import APPROACH_M_S, stops
 from logs.wire import packets
 
 ROUNDING = 1e-5  # share of a limit that rounding may take: the gate allows as much
@@ -31,121 +29,6 @@ STOP_SLACK_S = 0.05  # ASSUMED: what a stop may take longer than its own ramp
 SPACING = 2.0  # periods: a longer pause that nobody declared is a fault
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    name: str
-    holds: bool
-    detail: str
-    skipped: bool = False  # it could not be judged; `detail` says why
-    worst: float | None = None  # the value nearest to, or farthest beyond, the limit
-    limit: float | None = None
-    unit: str = ""
-    moment: str = ""  # of the worst
-
-
-Rule = Callable[[Evidence], Finding]
-
-
-def _skip(name: str, why: str) -> Finding:
-    return Finding(name, True, f"not judged: {why}", skipped=True)
-
-
-# --- who and whole ---------------------------------------------------------------------------------------------------
-
-
-def identity(e: Evidence) -> Finding:
-    """The attachments that the session began with are there, unaltered."""
-    return _each_part(e, "identity", _part_identity)
-
-
-def _part_identity(part: Log) -> Finding:
-    told, files = part.session, part.attachments
-    promised = {key.removeprefix("sha256 "): value for key, value in told.items() if key.startswith("sha256 ")}
-    wrong = [name for name, value in promised.items() if hashlib.sha256(files.get(name, b"")).hexdigest() != value]
-    who = ", ".join(f"{key} {told.get(key, 'unknown')}" for key in ("cell", "git_commit", "operator", "started"))
-    later = f", later {', '.join(sorted(files.keys() - promised))}" if files.keys() - promised else ""
-    detail = f"{who}, {len(files)} attachments{later}"
-    return Finding("identity", not wrong, f"altered or missing: {', '.join(wrong)}" if wrong else detail)
-
-
-def seals(e: Evidence) -> Finding:
-    """Seals hold (the reader has checked each), reach to the end, and are of a key that the auditor trusts."""
-    return _each_part(e, "seals", lambda part: _part_seals(e, part))
-
-
-def _part_seals(e: Evidence, part: Log) -> Finding:
-    s, name = part.seals, "seals"
-    if not s.public_key:
-        return Finding(name, False, "the session was not sealed: nothing shows that it is unaltered")
-    if not s.count:
-        return Finding(name, False, "the session should be sealed, and has no seal")
-    whole, key = part.extent.data_bytes, seal.key_id(s.public_key)
-    detail = f"{s.count} seals hold, to byte {s.sealed_bytes} of {whole}, key {key}"
-    if e.trusted is None:
-        return Finding(name, True, f"{detail}; whose key it is was not said (--public-key)")
-    if seal.raw_hex(e.trusted) != s.public_key:
-        return Finding(name, False, f"signed with {key}, which is not {e.trusted_name} (--public-key)")
-    rest = "" if s.final else f"; the last {whole - s.sealed_bytes} bytes are not sealed"
-    return Finding(name, True, f"{detail}, as {e.trusted_name}{rest}")
-
-
-def _each_part(e: Evidence, name: str, judge: Callable[[Log], Finding]) -> Finding:
-    """The verdict on a session of several files: each must hold, and each is named."""
-    found = [judge(part) for part in e.log.parts]
-    if len(found) == 1:
-        return found[0]
-    detail = "; ".join(f"part {i}: {finding.detail}" for i, finding in enumerate(found, 1))
-    holds, skipped = all(finding.holds for finding in found), all(finding.skipped for finding in found)
-    return Finding(name, holds, detail, skipped)
-
-
-def signature(e: Evidence) -> Finding:
-    """The detached signature, if there is one, is of this file as it is."""
-    return _each_part(e, "signature", _part_signature)
-
-
-def _part_signature(part: Log) -> Finding:
-    holds = seal.check_file(part.path, part.seals.public_key) if part.seals.public_key else None
-    if holds is None:
-        return _skip("signature", f"there is no {seal.signature_path(part.path).name}")
-    return Finding("signature", holds, "over every byte" if holds else "does not belong to this file")
-
-
-def closed(e: Evidence) -> Finding:
-    """The file was closed by the logger, or afterwards by `asc recover`."""
-    return _each_part(e, "closed", _part_closed)
-
-
-def _part_closed(part: Log) -> Finding:
-    if part.truncated:
-        left = len(part.data) - part.extent.complete_bytes
-        return Finding("closed", False, f"not closed, {left} bytes behind the last whole record; run asc recover")
-    if part.recovered:
-        told = part.recovered
-        added = f", {told['cycles_from_ring']} cycles from the ring" if told["cycles_from_ring"] != "0" else ""
-        return Finding("closed", True, f"recovered, {told['bytes_cut']} bytes cut{added}")
-    return Finding("closed", True, f"by the logger: {part.end.get('reason', 'unknown')}")
-
-
-def records(e: Evidence) -> Finding:
-    """Every cycle record's own checksum is right."""
-    detail = "every record's checksum is right" if not e.broken_records else f"{e.broken_records} records were altered"
-    return Finding("records", e.broken_records == 0, detail)
-
-
-def completeness(e: Evidence) -> Finding:
-    """Ticks increase by one from the first cycle to the last, and nothing was dropped."""
-    step = np.diff(e.c["inputs.tick"])
-    gaps, twice = np.flatnonzero(step > 1), np.flatnonzero(step < 1)
-    lost = dropped(e.log, e.c["inputs.tick"])
-    e.notes["gaps"] = [[int(e.c["inputs.tick"][i]), int(step[i]) - 1] for i in gaps[:100]]
-    if not len(gaps) and not len(twice) and not lost:
-        return Finding("completeness", True, f"{e.cycles} cycles, none missing")
-    first = f", first at {e.at(int(np.append(gaps, twice).min()))}" if len(gaps) + len(twice) else ""
-    detail = f"{lost} cycles missing in {len(gaps)} gaps, {len(twice)} out of order{first}"
-    return Finding("completeness", False, detail)
-
-
 # --- time ------------------------------------------------------------------------------------------------------------
 
 
@@ -154,7 +37,7 @@ def timing(e: Evidence) -> Finding:
     name, period = "timing", e.log.params.period_ns
     spacing = np.diff(e.c["inputs.t_ns"])
     if not len(spacing):
-        return _skip(name, "fewer than two cycles")
+        return skip(name, "fewer than two cycles")
     declared = (e.c["inputs.late"][1:] != 0) | (e.c["inputs.missed_ticks"][1:] > 0)
     bad = e.moving[1:] & ((spacing <= 0) | ((spacing > SPACING * period) & ~declared))
     worst = int(spacing.argmax())
@@ -174,7 +57,7 @@ def human_age(e: Evidence) -> Finding:
     """In every cycle that works towards a goal the person's state is there, healthy and young enough."""
     active = e.mode_after == Mode.ACTIVE
     if not active.any():
-        return _skip("human age", "the arm was never active")
+        return skip("human age", "the arm was never active")
     age, limit = e.c["inputs.human_age_ns"], e.log.params.human.age_limit_ns
     there = (e.c["inputs.human.present"] == 1) & (e.c["inputs.human_fault"] == 0)
     healthy = e.c["inputs.human.health"] != Health.FAULT
@@ -197,7 +80,7 @@ def _within(
 ) -> Finding:
     """`share` of its limit that each joint uses in each cycle, (cycles, joints). More than 1 breaks it; NaN does."""
     if not len(share):
-        return _skip(name, "no cycles")
+        return skip(name, "no cycles")
     used = np.where(np.isnan(share), np.inf, share)
     cycle, joint = np.unravel_index(int(used.argmax()), used.shape)
     holds = bool(used[cycle, joint] <= 1.0 + ROUNDING)
@@ -233,7 +116,7 @@ def acceleration(e: Evidence) -> Finding:
 def jerk(e: Evidence) -> Finding:
     """Change of the commanded acceleration from one cycle to the next."""
     if e.log.params.control == "torque":
-        return _skip("joint jerk", "a torque-controlled arm has no jerk limit")
+        return skip("joint jerk", "a torque-controlled arm has no jerk limit")
     limits = np.array(e.log.params.robot.dddq_max)
     jerks = np.diff(e.c["state.ddq_cmd"], axis=0) / e.log.params.period
     jerks[np.diff(e.c["inputs.tick"]) != 1] = 0.0  # across a gap nothing can be said
@@ -243,7 +126,7 @@ def jerk(e: Evidence) -> Finding:
 def torque(e: Evidence) -> Finding:
     sent = e.c["outputs.command.kind"] == CommandKind.TORQUE
     if not sent.any() or not e.log.params.robot.effort:
-        return _skip("joint torque", "no torques were sent")
+        return skip("joint torque", "no torques were sent")
     limits = np.array(e.log.params.robot.effort)
     tau = np.where(sent[:, None], e.c["outputs.command.tau"], 0.0)
     return _within(e, "joint torque", np.abs(tau) / limits, "Nm", tau, limits)
@@ -257,7 +140,7 @@ def separation(e: Evidence) -> Finding:
     comes nearer, too; that the arm gives way is for the safety rows.)"""
     d, limit = e.c["outputs.decision.d_measured"], e.log.params.safety.d_min
     if not np.isfinite(d).any():
-        return _skip("separation", "nobody was near")
+        return skip("separation", "nobody was near")
     moves = (np.abs(e.c["inputs.joint.dq"]).max(axis=1) > STANDING) & (e.c["inputs.joint.present"] == 1)
     near = np.flatnonzero(moves & (d < limit))
     bad = near[approach(e, near) > APPROACH_M_S]
@@ -290,7 +173,7 @@ def safety_rows(e: Evidence) -> Finding:
     bad = slack < -MARGIN
     phi = np.where(solved, e.c["worst_phi"], -np.inf)
     if not np.isfinite(phi).any():
-        return _skip("safety rows", "no pair was active")
+        return skip("safety rows", "no pair was active")
     worst = int(phi.argmax())
     shared = int((solved & ~whole).sum())
     detail = f"worst phi {phi[worst]:.4g} at {e.at(worst)}; in {shared} cycles the ramp was shared"
@@ -367,10 +250,10 @@ def wire_bytes(e: Evidence) -> Finding:
     """Every sent packet, decoded independently of the driver, says the recorded command."""
     name = "sent bytes"
     if f'"{audit_wire.STREAM_MOTION}"' not in e.log.session.get("driver", ""):
-        return _skip(name, "there is no independent decoder for this driver")
+        return skip(name, "there is no independent decoder for this driver")
     _, sent = packets(e.log)
     if not sent:
-        return _skip(name, "no packets were recorded")
+        return skip(name, "no packets were recorded")
     claims = np.flatnonzero((e.c["receipt.present"] == 1) & (e.c["receipt.ok"] == 1))
     worst, at = 0.0, 0
     for i in claims:
@@ -388,15 +271,15 @@ def wire_bytes(e: Evidence) -> Finding:
 def certificate(e: Evidence) -> Finding:
     """The certificate covered the mounted tool."""
     if schema.CERTIFICATE not in e.log.attachments:
-        return _skip("certificate", "the cell names none")
-    return _skip("certificate", "attached, but its contents are not judged yet")
+        return skip("certificate", "the cell names none")
+    return skip("certificate", "attached, but its contents are not judged yet")
 
 
 def replayed(e: Evidence) -> Finding:
     """The same code decides the same again."""
     r = e.replay
     if r is None or not r.cycles:
-        return _skip("replay", "no cycle was run again")
+        return skip("replay", "no cycle was run again")
     how = "bytes" if r.fingerprint_match else f"not exact: another machine, tolerance {r.tolerance:g}"
     detail = f"{r.cycles} of {e.cycles} cycles run again ({how}), {r.mismatches} differ"
     if r.first_difference is not None:
@@ -409,7 +292,7 @@ def wire(e: Evidence) -> Finding:
     """Raw packets through the driver's codec give the record, and the record gives the packets."""
     r = e.replay
     if r is None:
-        return _skip("wire", "no cycle was run again")
+        return skip("wire", "no cycle was run again")
     how = f"of {r.cycles} cycles decoded again" if r.wire_decoded else "present (this driver's codec cannot be asked)"
     detail = f"packets {how}, {r.wire_mismatches} mismatches" + (f"; first: {r.wire_first}" if r.wire_first else "")
     return Finding("wire", r.wire_mismatches == 0, detail)
