@@ -8,7 +8,7 @@ Recovery is policy (`asc_rt.core.mode`) plus a person.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
@@ -96,6 +96,24 @@ class ReplayCodec(Protocol):
 
     def encode_set_point(self, seq: int, q: Vector, last: bool) -> bytes:
         """The packet that `write` sends for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of an examination."""
+
+    name: str
+    ok: bool
+    detail: str
+    fix: str = ""  # what to do if it is not ok
+
+
+@runtime_checkable
+class Examinable(Protocol):
+    """A driver that can look at its robot without moving it, for `asc doctor`. Optional."""
+
+    def examine(self, period_ns: int) -> Iterator[Finding]:
+        """What is found, as it is found. Opens the link and closes it; raises nothing of the robot's or the wire's."""
 
 
 class RobotDriver(Protocol):

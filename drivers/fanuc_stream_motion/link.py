@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from asc_rt.core.types import JointState, Vector
-from drivers.base import HandshakeError, LinkError, RobotFaulted, WireTap
+from drivers.base import Finding, HandshakeError, LinkError, RobotFaulted, WireTap
 from drivers.fanuc_stream_motion import alarms, codec
 from drivers.fanuc_stream_motion.limits import FLOAT32_STEP
 from drivers.fanuc_stream_motion.options import ClassicOptions
@@ -113,11 +114,16 @@ class StreamMotion(Session):
                 return packet[1]
         return None
 
-    def _begin(self) -> None:
-        self._send(codec.encode_start(self._options.version))
+    def _listen(self, on: bool) -> None:
+        self._send((codec.encode_start if on else codec.encode_stop)(self._options.version))
 
-    def _leave(self) -> None:
-        self._send(codec.encode_stop(self._options.version))
+    def _question(self) -> bytes:
+        """Version 1 has no version request."""
+        version = self._options.version
+        return codec.encode_version_request(version) if version > 1 else codec.encode_threshold_request(1, 1, 0)
+
+    def findings(self) -> Iterator[Finding]:
+        yield Finding("robot override", True, "this wire does not tell it: it has to be 100 % at the pendant")
 
     def _await_ready(self) -> tuple[int, Status]:
         deadline_ns = self._wire.now_ns() + round(self._options.ready_timeout * SECOND_NS)

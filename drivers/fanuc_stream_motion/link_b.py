@@ -6,6 +6,7 @@ dangerous: the arm coasts at its last speed for about a tenth of a second and th
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from asc_rt.core.types import Vector
-from drivers.base import DriverError, HandshakeError, LinkError, RobotFaulted, WireTap
+from drivers.base import DriverError, Finding, HandshakeError, LinkError, RobotFaulted, WireTap
 from drivers.fanuc_stream_motion import alarms, codec_b
 from drivers.fanuc_stream_motion.options import Check, Options, is_number, is_port
 from drivers.fanuc_stream_motion.packets import DOF, Command, Status, Thresholds
@@ -57,6 +58,7 @@ class StreamMotionB(Session):
         super().__init__(o, tap, transport or UdpTransport(o.host, o.port, o.lock_dir))
         self._rmi = Rmi(line or TcpLine(o.host), o.rmi_port)
         self._version = ASKED_VERSION
+        self._buffered = 0  # commands before motion, as the robot says
 
     def close(self) -> None:
         super().close()
@@ -86,6 +88,7 @@ class StreamMotionB(Session):
                 hint="use the driver fanuc-j519 for this controller",
             )
         self._version = min(capability.version, max(codec_b.VERSIONS))
+        self._buffered = capability.start_move
         self._configure()
         if self._options.limits:
             self._guard.take(self._ask_tables())
@@ -110,6 +113,7 @@ class StreamMotionB(Session):
                 f"the robot does not take start_move = {wanted}",
                 hint="take driver.start_move out of the cell file, and set it at the pendant",
             )
+        self._buffered = wanted
 
     def _ask_tables(self) -> list[Thresholds]:
         told: list[Thresholds] = []
@@ -139,10 +143,26 @@ class StreamMotionB(Session):
                 return packet[1]
         return None
 
+    def _listen(self, on: bool) -> None:
+        self._send((codec_b.encode_start if on else codec_b.encode_stop)(self._version))
+
+    def _question(self) -> bytes:
+        return codec_b.encode_capability_request(self._version)
+
+    def findings(self) -> Iterator[Finding]:
+        told = self._rmi.status()
+        override, pendant = told.get("Override", 100), bool(told.get("TPMode"))
+        fix = "set the override to 100 % at the pendant"
+        yield Finding("robot override", override == 100, f"{override} %", fix)
+        off = "switch the pendant off, mode AUTO"
+        yield Finding("robot pendant", not pendant, "enabled" if pendant else "off, as it has to be", off)
+        buffered = f"{self._buffered} commands are buffered before the arm moves"
+        yield Finding("robot buffer", True, buffered)
+
     def _begin(self) -> None:
         """The call comes before Start: the other way round the robot never gets ready."""
         self._rmi.start(PROGRAM)
-        self._send(codec_b.encode_start(self._version))
+        self._listen(True)
         if self._options.force_sensor:
             self._send(codec_b.encode_force_sensor(self._version, self._options.force_sensor))
 
@@ -160,7 +180,7 @@ class StreamMotionB(Session):
                 raise self._with_alarm(self._diagnose(status))
 
     def _leave(self) -> None:
-        self._send(codec_b.encode_stop(self._version))
+        self._listen(False)
         with suppress(DriverError):
             self._rmi.abort()
         if self.fault is not None:

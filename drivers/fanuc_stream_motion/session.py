@@ -9,6 +9,7 @@ set-points of its own: a jerk-limited stop from what was sent.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -17,6 +18,7 @@ from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, 
 from drivers.base import (
     DriverCaps,
     DriverError,
+    Finding,
     HandshakeError,
     LinkError,
     Pacing,
@@ -24,6 +26,7 @@ from drivers.base import (
     WireTap,
     WriteReceipt,
 )
+from drivers.fanuc_stream_motion import examine
 from drivers.fanuc_stream_motion.braking import stop_way
 from drivers.fanuc_stream_motion.guard import Guard
 from drivers.fanuc_stream_motion.intake import Intake
@@ -82,16 +85,27 @@ class Session:
         """Is there a controller that speaks our wire? Its identity; reads the tables if asked for."""
         raise NotImplementedError
 
-    def _begin(self) -> None:
-        """Make statuses flow."""
+    def _listen(self, on: bool) -> None:
+        """Statuses flow, or stop; nothing else happens at the robot."""
         raise NotImplementedError
+
+    def _begin(self) -> None:
+        """Have the robot's program wait for set-points, as far as that is ours to do, and statuses flow."""
+        self._listen(True)
 
     def _await_ready(self) -> tuple[int, Status]:
         """The first status at which commands are welcome."""
         raise NotImplementedError
 
     def _leave(self) -> None:
-        """Stop the statuses."""
+        self._listen(False)
+
+    def _question(self) -> bytes:
+        """A request that every controller of this wire answers."""
+        raise NotImplementedError
+
+    def findings(self) -> Iterator[Finding]:
+        """What else this wire can tell to an examination."""
         raise NotImplementedError
 
     def _has_left(self, status: Status) -> bool:
@@ -188,6 +202,38 @@ class Session:
         self.stop()
         self._wire.close()
         self._phase = Phase.CLOSED
+
+    # --- examination ---------------------------------------------------------------------------------------------
+
+    def examine(self, period_ns: int) -> Iterator[Finding]:
+        """See `drivers.base.Examinable`."""
+        yield from examine.examine(self, period_ns)
+
+    @property
+    def host(self) -> str:
+        return self._common.host
+
+    def watch(self, count: int) -> list[tuple[int, Status]]:
+        """So many statuses as they come, without any command. LinkError: none comes."""
+        self._forget()
+        self._drain()
+        self._listen(True)
+        try:
+            return [self._await_status() for _ in range(count)]
+        finally:
+            self._listen(False)
+
+    def ask(self) -> int | None:
+        """ns until a question is answered; None: it is not."""
+        asked_ns = self._send(self._question())
+        packet = self._receive(asked_ns + ANSWER_TIMEOUT_NS)
+        while packet is not None and isinstance(packet[1], Status):
+            packet = self._receive(asked_ns + ANSWER_TIMEOUT_NS)
+        return None if packet is None else packet[0] - asked_ns
+
+    def check_pose(self, status: Status) -> None:
+        """HandshakeError: the robot is another arm, or means other angles."""
+        self._guard.check_pose(status)
 
     # --- handshake -----------------------------------------------------------------------------------------------
 

@@ -48,7 +48,7 @@ class UdpTransport:
             return
         try:
             self._peer = (socket.gethostbyname(self._host), self._port)
-            local = _local_address(self._peer)
+            local = local_address(self._peer)
         except OSError as error:
             raise LinkError(
                 f"no way to {self._host}: {error.strerror or error}",
@@ -106,7 +106,7 @@ class UdpTransport:
         return self._socket
 
 
-def _local_address(peer: tuple[str, int]) -> str:
+def local_address(peer: tuple[str, int]) -> str:
     """This PC's address on the way to `peer`, so that no other network reaches our socket. Sends nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(peer)
