@@ -11,13 +11,15 @@ import numpy as np
 
 from sim_hil.fanuc import alarms
 from sim_hil.fanuc.alarms import Alarm
-from sim_hil.fanuc.arm import ARMS, Array, Plant, Servo
+from sim_hil.fanuc.arm import ARMS, Array, Plant, Servo, from_wire
 from sim_hil.fanuc.settings import Settings
 from sim_hil.fanuc.signals import Signals
+from sim_hil.fanuc.tables import LimitCheck
 
 Peer = tuple[str, int]
 
 READY, COMMANDED, SERVO_ON, MOVING = 1, 2, 4, 8
+LAST_AT_REST = 1e-4  # rad: a last command farther from the one before it is not at rest
 _AT_REST = 1e-3  # rad/s
 
 
@@ -46,6 +48,9 @@ class Cabinet:
         self._plant = plant
         brake = np.full(len(plant.q), math.radians(s.brake_deg_s2))
         self._servo = Servo(plant.q, s.period, s.filter_cycles, s.lag_ms * 1e-3, brake)
+        self._limits = LimitCheck(self.arm.tables, s.payload_share, s.period, self._flange_mm)
+        self._peer: Peer | None = None  # the PC of the session
+        self._version = 0  # that it speaks
         self._cycles = 0
         self._sequence = 0
         self._clock_jump_ms = 0
@@ -53,7 +58,34 @@ class Cabinet:
 
     def cycle(self, packets: Iterable[tuple[Peer, bytes]]) -> list[tuple[Peer, bytes]]:
         """One period: what came in since the last -> what goes out."""
+        out = [(peer, reply) for peer, data in packets if (reply := self._take(peer, data)) is not None]
+        self._move()
+        self._plant.set_target(self._servo.q)
+        self._plant.step()
+        self._cycles += 1
+        if self._peer is not None:
+            self._sequence = (self._sequence + 1) % 2**32
+            if self._cycles % self._every == 0:
+                out.append((self._peer, self._status()))
+        return out
+
+    # --- what the wires differ in --------------------------------------------------------------------------------
+
+    def _take(self, peer: Peer, data: bytes) -> bytes | None:
+        """Obey one packet; its reply, if it has one of its own."""
         raise NotImplementedError
+
+    def _move(self) -> None:
+        """What the servos do in this cycle."""
+        raise NotImplementedError
+
+    def _status(self) -> bytes:
+        raise NotImplementedError
+
+    @property
+    def _every(self) -> int:
+        """Of how many cycles one is told."""
+        return 1
 
     def greeting(self, name: str) -> bytes:
         """A "start" or "stop" as a PC would send it."""
@@ -134,8 +166,5 @@ class Cabinet:
     def _offend(self, rule: str, data: bytes) -> None:
         self.offences.append(Offence(rule, data))
 
-    def _drive(self) -> None:
-        """The mechanics, one period after the servos were told."""
-        self._plant.set_target(self._servo.q)
-        self._plant.step()
-        self._cycles += 1
+    def _flange_mm(self, pendant: Array) -> Array:
+        return 1e3 * self.arm.place(from_wire(pendant, len(pendant)))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from enum import Enum
 from typing import NamedTuple
 
@@ -18,12 +17,10 @@ import numpy as np
 from sim_hil.fanuc import alarms, wire
 from sim_hil.fanuc.alarms import Alarm
 from sim_hil.fanuc.arm import Array, Plant, from_wire, to_wire
-from sim_hil.fanuc.cabinet import COMMANDED, MOVING, READY, SERVO_ON, Cabinet, Peer
+from sim_hil.fanuc.cabinet import COMMANDED, LAST_AT_REST, MOVING, READY, SERVO_ON, Cabinet, Peer
 from sim_hil.fanuc.settings import Settings, thresholds
 from sim_hil.fanuc.signals import Unassigned
-from sim_hil.fanuc.tables import LimitCheck
 
-_LAST_AT_REST = 1e-4  # rad: a last command farther from the one before it is not at rest
 _COMMANDED_EVERY_S = 0.1  # the commanded position is told at most this often
 
 
@@ -50,10 +47,7 @@ class Controller(Cabinet):
         s = self.settings
         self.ignored = 0  # commands that came while an alarm was on
         self.program = Program.WAITING if s.program_starts else Program.STOPPED
-        self._limits = LimitCheck(self.arm.tables, s.payload_share, s.period, self._flange_mm)
         self._loop_left = 0
-        self._peer: Peer | None = None
-        self._version = 0
         self._told_commanded = -math.inf
         self._window = (0, 0, 0)  # of signals, that the status tells
         self._queue: deque[Command] = deque()
@@ -77,21 +71,6 @@ class Controller(Cabinet):
     @property
     def ready(self) -> bool:
         return self.program is Program.WAITING and not self.alarms
-
-    def cycle(self, packets: Iterable[tuple[Peer, bytes]]) -> list[tuple[Peer, bytes]]:
-        """One period: what came in since the last -> what goes out."""
-        out: list[tuple[Peer, bytes]] = []
-        for peer, data in packets:
-            reply = self._take(peer, data)
-            if reply is not None:
-                out.append((peer, reply))
-        self._move()
-        self._drive()
-        if self._peer is not None:
-            self._sequence = (self._sequence + 1) % 2**32
-            if self._cycles % self._every == 0:
-                out.append((self._peer, self._status()))
-        return out
 
     @property
     def _every(self) -> int:
@@ -124,9 +103,6 @@ class Controller(Cabinet):
         self._servo.follow(command.q)
         if command.last:
             self._pass_ibgn_end()
-
-    def _flange_mm(self, pendant: Array) -> Array:
-        return 1e3 * self.arm.place(from_wire(pendant, len(pendant)))
 
     def _enter_ibgn(self) -> None:
         self._queue.clear()
@@ -205,7 +181,7 @@ class Controller(Cabinet):
             self._alarm(alarm, data)
         else:
             self._style = packet["data_style"]
-            if packet["last_data"] and self._newest is not None and np.max(np.abs(q - self._newest)) > _LAST_AT_REST:
+            if packet["last_data"] and self._newest is not None and np.max(np.abs(q - self._newest)) > LAST_AT_REST:
                 self._offend("last_data while moving", data)
             self._expected = (packet["sequence"] + 1) % 2**32
             self._newest = q

@@ -7,18 +7,16 @@ about a tenth of a second, then it stops hard, again without an alarm. Figures m
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sim_hil.fanuc import alarms, wire_b
 from sim_hil.fanuc.alarms import Alarm
-from sim_hil.fanuc.arm import Array, Plant
-from sim_hil.fanuc.cabinet import MOVING, READY, SERVO_ON, Cabinet, Peer
+from sim_hil.fanuc.arm import Array, Plant, to_wire
+from sim_hil.fanuc.cabinet import LAST_AT_REST, MOVING, READY, SERVO_ON, Cabinet, Peer
 from sim_hil.fanuc.settings import Settings, thresholds
 from sim_hil.fanuc.signals import DI, DO, RI, RO, Unassigned
-from sim_hil.fanuc.tables import LimitCheck
 from sim_hil.fanuc.wire import Malformed, Packet
 
 IN_ERROR, PENDANT_ENABLED, STOP_PRESSED = 1, 2, 4
@@ -27,7 +25,6 @@ _DIP_AT_S, _DIP_S = 1.0, 0.6  # after a repeated call: not ready, for less than 
 # Silence is endured so long, depending on the speed: 121 ms at 15.3 deg/s, 71 ms at 49.9 deg/s. MEASURED
 _ENDURED = ((15.3, 0.121), (49.9, 0.071))
 _SIGNAL_TYPES = {0: DO, 1: DI, 2: RO, 3: RI}
-_LAST_AT_REST = 1e-4  # rad
 MOST_BUFFERED = 9  # commands before motion. DATASHEET
 
 
@@ -47,12 +44,9 @@ class ControllerB(Cabinet):
         self.safety_scale = 1.0  # collaborative speed clamp
         self.over_limit = 0  # cycles that had to be smoothed
         self.silent_stops = 0  # times that the arm was stopped because nothing came
-        self._limits = LimitCheck(self.arm.tables, s.payload_share, s.period, self._flange_mm)
         self.force = np.zeros(6)  # N and Nm that the sensor feels
         self._force_sensor = 0  # not chosen
         self._start_move = s.start_move
-        self._peer: Peer | None = None
-        self._version = 0
         self._slots: list[tuple[int, int, int]] = []  # signals that the statuses tell: type, first, length
         self._calls = 0
         self._called_at: int | None = None  # cycle of the call of STREAM_MOTN that is running
@@ -133,19 +127,6 @@ class ControllerB(Cabinet):
 
     # --- cycle ---------------------------------------------------------------------------------------------------
 
-    def cycle(self, packets: Iterable[tuple[Peer, bytes]]) -> list[tuple[Peer, bytes]]:
-        out: list[tuple[Peer, bytes]] = []
-        for peer, data in packets:
-            reply = self._take(peer, data)
-            if reply is not None:
-                out.append((peer, reply))
-        self._move()
-        self._drive()
-        if self._peer is not None:
-            self._sequence = (self._sequence + 1) % 2**32
-            out.append((self._peer, self._status()))
-        return out
-
     def _move(self) -> None:
         if self._queue and (len(self._queue) > self._start_move or self._queue[-1].last):
             self._draining = True
@@ -165,7 +146,7 @@ class ControllerB(Cabinet):
             self._servo.hold()
             return
         before = self._plant.q if self._target is None else self._target
-        if self._limits.excess(_pendant(command.q)) is not None:
+        if self._limits.excess(to_wire(command.q)[: len(command.q)]) is not None:
             self.over_limit += 1
         fastest = np.radians(self.arm.tables.at(0.0, 1.0)[0]) * self.safety_scale * self.settings.period
         self._target = before + np.clip(command.q - before, -fastest, fastest)
@@ -187,11 +168,6 @@ class ControllerB(Cabinet):
             return
         self._target = self._target + self._speed * self.settings.period
         self._servo.follow(self._target)
-
-    def _flange_mm(self, pendant: Array) -> Array:
-        q = pendant.copy()
-        q[2] += q[1]
-        return 1e3 * self.arm.place(np.radians(q))
 
     # --- packets in ----------------------------------------------------------------------------------------------
 
@@ -258,7 +234,7 @@ class ControllerB(Cabinet):
         if self._newest is None and np.max(np.abs(q - self._plant.q)) > np.radians(self.settings.start_threshold_deg):
             self._alarm(alarms.ABNORMAL, data)
             return
-        if packet["last"] and self._newest is not None and np.max(np.abs(q - self._newest)) > _LAST_AT_REST:
+        if packet["last"] and self._newest is not None and np.max(np.abs(q - self._newest)) > LAST_AT_REST:
             self._offend("last command while moving", data)
         self._expected = (packet["sequence"] + 1) % 2**32
         self._newest = q
@@ -329,9 +305,3 @@ class ControllerB(Cabinet):
             signals=np.frombuffer(told.ljust(wire_b.SIGNAL_BYTES, b"\0"), "u1"),
             **sensed,
         )
-
-
-def _pendant(q: Array) -> Array:
-    pendant = np.degrees(q)
-    pendant[2] -= pendant[1]
-    return pendant
