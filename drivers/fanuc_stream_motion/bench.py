@@ -1,8 +1,9 @@
 """What the wire costs: `python -m drivers.fanuc_stream_motion.bench [--host ADDRESS] [--port N] [--cycles N]`.
 
 Without a host, packets <-> numbers alone. With one, a session that holds the arm where it is, on the classic wire.
-Rows, JSON, us: `codec` decode a status and encode, check and read back its command; `wake` a status in the kernel -> in
-this process; `answer` from there -> its command sent; `wake_to_send` both; `round_trip` a command sent -> next status.
+Rows, JSON, us: `codec` decode a status and encode, check and read back its command (`codec_ros` on the other wire);
+`wake` a status in the kernel -> in this process; `answer` from there -> its command sent; `wake_to_send` both;
+`round_trip` a command sent -> next status.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ import os
 import socket
 import struct
 import time
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, vector
 from drivers.base import LinkError
-from drivers.fanuc_stream_motion import codec
+from drivers.fanuc_stream_motion import codec, codec_b
 from drivers.fanuc_stream_motion.arms import ARMS
 from drivers.fanuc_stream_motion.limits import LimitCheck, Tables
 from drivers.fanuc_stream_motion.link import StreamMotion
@@ -66,15 +68,26 @@ def _tables() -> list[Thresholds]:
 
 
 def bench_codec(version: int, repetitions: int = REPETITIONS) -> list[int]:
-    """ns per cycle of everything that turns bytes into numbers and back."""
+    """ns per cycle of everything that turns bytes into numbers and back, on the classic wire."""
     status = struct.pack(">III BBHHH I 27f", 0, version, 7, 5, 0, 0, 0, 0, 0, *np.linspace(-90, 90, 27))
+    return _time(codec, status, version, repetitions)
+
+
+def bench_codec_ros(repetitions: int = REPETITIONS) -> list[int]:
+    """The same on the ROS 2 wire, version 3."""
+    numbers = np.linspace(-90, 90, 28)
+    status = struct.pack(">III BBBB I 28f 256s", 202, 3, 7, 5, 0, 0, 0, 0, *numbers, bytes(256))
+    return _time(codec_b, status, 3, repetitions)
+
+
+def _time(wire: ModuleType, status: bytes, version: int, repetitions: int) -> list[int]:
     check = LimitCheck(Tables(_tables(), 1.0), ARMS["lrmate_200id"], PERIOD_NS * 1e-9)
     spent = []
     for _ in range(repetitions):
         began = time.perf_counter_ns()
-        joint = codec.decode(status, version)
-        data = codec.encode_command(version, 7, joint.q, False)  # type: ignore[union-attr]
-        told = codec.decode_command(data)
+        joint = wire.decode(status, version)
+        data = wire.encode_command(version, 7, joint.q, False)
+        told = wire.decode_command(data)
         check.breach(told.q)
         check.sent(told.q)
         spent.append(time.perf_counter_ns() - began)
@@ -119,7 +132,7 @@ def main() -> None:
         real_time = True
     except OSError:
         real_time = False
-    times = {"codec": bench_codec(args.version)}
+    times = {"codec": bench_codec(args.version), "codec_ros": bench_codec_ros()}
     if args.host:
         times |= bench_session(args.host, args.port, args.version, args.cycles)
     rows: list[dict[str, Any]] = [

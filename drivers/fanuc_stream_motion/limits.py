@@ -10,7 +10,6 @@ one. The check goes by the flange speed of the moment, and is there for a flange
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import dist
@@ -26,6 +25,7 @@ KINDS = ("velocity", "acceleration", "jerk")
 UNITS = ("deg/s", "deg/s2", "deg/s3")
 MARGIN = 0.02  # the core plans this share below the tables
 REFUSE = 0.005  # a set-point within this share of a table is not sent: the controller may compute it differently
+_TABLE_OF = np.array([*range(DOF), 2])  # whose table holds for joints 1 to 6 and FANUC's J3
 FLOAT32_STEP = np.radians(2.0**-16)  # rad, half the distance of float32 angles between 256 and 512 deg
 
 
@@ -106,31 +106,34 @@ class LimitCheck:
 
     def __init__(self, tables: Tables, arm: Arm, period: float) -> None:
         self._tables, self._arm, self._period = tables, arm, period
-        self._past: deque[Vector] = deque(maxlen=3)
-        self._place: Point | None = None  # of the flange, at the newest of them
-        self._speed = 0.0
+        self._newest: tuple[Matrix, Point] | None = None  # motion and flange of the set-point sent last
+        self._speed = 0.0  # of the flange, m/s
 
     def breach(self, q: Vector) -> Breach | None:
         """What the set-point `q` (6,) rad would break, if it came next."""
-        speed = self._speed_to(q)
-        limits = np.minimum(self._tables.at(self._speed), self._tables.at(speed))
-        limits = (1.0 - REFUSE) * np.column_stack([limits, limits[:, 2]])  # (3, 7), the seventh: FANUC's J3
-        rows = np.array([*(self._past or [q] * 3), q])
-        rows = np.column_stack([rows, rows[:, 2] - rows[:, 1]])
-        for kind in range(3):
-            rows = np.diff(rows, axis=0) / self._period
-            over = np.abs(rows[-1]) - limits[kind]
-            axis = int(np.argmax(over))
-            if over[axis] > 0:
-                joint = 3 if axis == 6 else axis + 1
-                return Breach(kind, joint, abs(float(rows[-1, axis])), float(limits[kind, axis]), speed)
-        return None
+        motion, _, speed = self._next(q)
+        limits = (1.0 - REFUSE) * np.minimum(self._tables.at(self._speed), self._tables.at(speed))
+        over = np.abs(motion[1:]) - limits[:, _TABLE_OF]
+        if over.max() <= 0:
+            return None
+        kind = int(np.argmax(over.max(axis=1) > 0))
+        worst = int(np.argmax(over[kind]))
+        axis = int(_TABLE_OF[worst])
+        return Breach(kind, axis + 1, abs(float(motion[1 + kind, worst])), float(limits[kind, axis]), speed)
 
     def sent(self, q: Vector) -> None:
         """`q` is out."""
-        self._speed = self._speed_to(q)
-        self._place = self._arm.place(q)
-        self._past.extend([q] if self._past else [q] * 3)
+        motion, place, self._speed = self._next(q)
+        self._newest = motion, place
 
-    def _speed_to(self, q: Vector) -> float:
-        return 0.0 if self._place is None else dist(self._arm.place(q), self._place) / self._period
+    def _next(self, q: Vector) -> tuple[Matrix, Point, float]:
+        """(4, 7) position and its backward differences, the seventh FANUC's J3; the flange, and its speed."""
+        motion, place = np.zeros((4, DOF + 1)), self._arm.place(q)
+        motion[0, :DOF] = q
+        motion[0, DOF] = q[2] - q[1]
+        if self._newest is None:  # everything before the first equals it
+            return motion, place, 0.0
+        before, last_place = self._newest
+        for k in range(3):
+            motion[k + 1] = (motion[k] - before[k]) / self._period
+        return motion, place, dist(place, last_place) / self._period

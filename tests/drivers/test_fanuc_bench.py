@@ -18,6 +18,7 @@ from sim_hil.fanuc.server import serve
 def test_the_codec_is_timed(version: int) -> None:
     times = bench.bench_codec(version, repetitions=50)
     assert len(times) == 50 and min(times) > 0
+    assert len(bench.bench_codec_ros(repetitions=50)) == 50
 
 
 def test_a_session_is_timed_from_the_kernels_stamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -33,6 +36,7 @@ from sim_hil.fanuc.lockstep import Lockstep, RmiLine
 from sim_hil.fanuc.rmi import RmiServer
 from sim_hil.fanuc.settings import Settings
 
+FAR = np.full((1, 3), 50.0)  # m
 SWAY = 0.35  # m, how far the person walks to and fro
 SHIFTS = [("fanuc-sim", 8, 3, 75_000), ("fanuc-sim", 4, 3, 150_000), ("fanuc-sim", 2, 3, 300_000)]  # 600 s each
 SHIFT = [pytest.mark.slow, pytest.mark.timeout(3600)]
@@ -41,7 +45,7 @@ SHIFT = [pytest.mark.slow, pytest.mark.timeout(3600)]
 class Cell:
     """Core, driver, robot; random goals; a person who walks to and fro beside the arm."""
 
-    def __init__(self, name: str, period_ms: int, version: int = 3, told: bool = True) -> None:
+    def __init__(self, name: str, period_ms: int, version: int = 3, told: bool = True, **options: Any) -> None:
         cell = load_cell(name, [f"period_ms={period_ms}"])
         table = {k: v for k, v in cell.sim["fanuc"].items() if k != "faults"}
         settings = Settings.parse({**table, "period_ms": float(period_ms), "limits": True})
@@ -52,12 +56,12 @@ class Cell:
             self.robot = controller = ControllerB(plant, settings)
             self.link = Lockstep(controller)
             line = RmiLine(self.link, RmiServer(controller, 16002))
-            options = {"host": "robot", "limits": True, "arm": "crx_10ia_l", "settle": 0.1}
+            options = {"host": "robot", "limits": True, "arm": "crx_10ia_l", "settle": 0.1, **options}
             self.driver = StreamMotionB(options, transport=self.link, line=line)
         else:
             self.robot = Controller(plant, settings)
             self.link = Lockstep(self.robot)
-            options = {"host": "robot", "limits": True, "arm": "lrmate_200id", "version": version}
+            options = {"host": "robot", "limits": True, "arm": "lrmate_200id", "version": version, **options}
             self.driver = StreamMotion(options, transport=self.link)
         limits = self.driver.configure().limits
         self.system = System(within(cell.params, limits) if told else cell.params)
@@ -133,6 +137,38 @@ def test_thousands_of_cycles_without_an_offence(name: str, period_ms: int, versi
     assert cell.reached > 0 and StopReason.OPERATOR_STOP in cell.stops
     assert getattr(cell.robot, "over_limit", 0) == 0 and getattr(cell.robot, "silent_stops", 0) == 0
     assert cell.driver.counters.missing == cell.driver.counters.stale == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "first_stage"), [("fanuc-sim", 0.2), ("crx-sim", 0.1)])
+def test_one_box_for_all_flange_speeds_costs_hardly_any_goals(name: str, first_stage: float) -> None:
+    """Against limits of the first stage, which no scheme that follows the flange speed can exceed."""
+    (box, box_speed), (best, _) = goals_a_minute(name, 0.0), goals_a_minute(name, first_stage)
+    print(f"{name}: {box:.2f} goals a minute, {best:.2f} with the first stage's limits, flange {box_speed:.2f} m/s")
+    assert box > 0.95 * best
+
+
+def goals_a_minute(name: str, flange_speed: float, goals: int = 24) -> tuple[float, float]:
+    """With nobody there, and the greatest flange speed [m/s]; limits up to `flange_speed`, which nobody checks."""
+    cell = Cell(name, 8, flange_speed=flange_speed)
+    cell.driver._guard._check = None
+    cell.robot.settings = dataclasses.replace(cell.robot.settings, limits=False)
+    arm, places, tick = cell.driver._guard._arm, [], 0
+    wanted = load_cell(name).goals
+    for number in range(goals):
+        goal = Goal(number + 1, vector(wanted[number % len(wanted)]))
+        while cell.state.reached_id < goal.id:
+            joint = cell.driver.read(cell.link.now_ns() + 24_000_000)
+            events = (OperatorEvent(tick + 1, EventKind.ARM),)
+            now = cell.link.now_ns()
+            nobody = dataclasses.replace(person(now), p0=FAR, p1=FAR)
+            x = CycleInputs(tick, now, 8_000_000, joint, nobody, 0, False, goal, events, 0, False)
+            cell.state, out = step(cell.system, cell.state, x)
+            assert out.command is not None
+            cell.driver.write(out.command)
+            places.append(arm.place(cell.state.q_cmd))
+            tick += 1
+    return 60.0 * goals / (tick * 0.008), float(np.linalg.norm(np.diff(places, axis=0), axis=1).max() / 0.008)
 
 
 def test_the_profile_alone_does_not_fit_both_conventions_of_j3_and_the_driver_says_so_before_it_sends() -> None:
