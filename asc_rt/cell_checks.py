@@ -109,6 +109,8 @@ def check_cell(path: Path, cell: CellFile, profile: ProfileFile, faults: Faults)
         faults.note(path, "safety.rearm_distance_m", f"{safety.rearm_distance_m:g} m is too small; at least {least}")
     if cell.sim and not cell.simulated:
         faults.note(path, "sim", "this cell is real; [sim.*] tables belong to a cell with simulated = true")
+    if cell.uncertified and not cell.simulated:
+        faults.note(path, "uncertified", "this cell is real; only a simulated one may run without a certificate")
     for device in cell.sim.keys() - topics.SIM_DEVICES.keys():
         known = list(topics.SIM_DEVICES)
         near = suggestion(device, known)

@@ -86,6 +86,8 @@ class CellFile(Table):
     robot: Text
     tool: Text
     simulated: Annotated[bool, Field(strict=True)]
+    certificates: Text = "certificates"  # folder beside the cell file, with ROBOT-TOOL.json
+    uncertified: Annotated[bool, Field(strict=True)] = False  # run without; simulated cells only
     period_ms: Literal[2, 4, 8]
     driver: Driver
     bus: Bus

@@ -61,12 +61,14 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a cell: controller, logger and, in a simulated cell, robot and person. Example: asc run --duration 20"""
+    from asc_rt.certified import require
     from asc_rt.config import load_cell
     from asc_rt.supervisor import run_cell
 
     if duration is not None and not (math.isfinite(duration) and duration > 0):
         _refuse(f"--duration: {duration:g} s is not possible; more than 0")
     config = load_cell(cell, overrides or [])
+    require(config)
     path = log or config.log_dir / f"{config.name}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
     if path.exists():
         _refuse(f"--log: {path} exists; recordings are never overwritten")

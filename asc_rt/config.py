@@ -59,6 +59,8 @@ class Cell:
     driver: dict[str, Any]  # the [driver] table, with `name`
     sim: dict[str, dict[str, Any]]  # the [sim.*] tables
     simulated: bool
+    certificates: Path  # folder
+    uncertified: bool  # runs whether or not a certificate covers it: in simulation, and recorded
     bus_endpoint: str
     goals: tuple[tuple[float, ...], ...]  # rad
     log_dir: Path
@@ -258,6 +260,8 @@ def _assemble(path: Path, text: str, overrides: Sequence[str], cell: CellFile, p
         driver=cell.driver.model_dump(),
         sim=cell.sim,
         simulated=cell.simulated,
+        certificates=path.resolve().parent / cell.certificates,
+        uncertified=cell.uncertified,
         bus_endpoint=cell.bus.endpoint,
         goals=tuple(_radians(goal) for goal in cell.task.goals_deg),
         log_dir=Path(cell.log.dir),

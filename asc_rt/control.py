@@ -20,6 +20,7 @@ from typing import Any
 
 from asc_rt import pacing, topics
 from asc_rt.bus import Bus, BusError, open_client
+from asc_rt.certified import require
 from asc_rt.config import Cell, ConfigError, load_cell
 from asc_rt.core.system import System
 from asc_rt.core.types import CommandKind, CoreState, CycleInputs, CycleOutputs, Mode, StopReason
@@ -96,6 +97,7 @@ def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder
         caps = driver.configure()
         _check(caps, system)
         system = System(within(cell.params, caps.limits))  # the smaller of the profile's and the robot's own limits
+        _certified(cell, system)
         warm_up(system)
         report = realtime.set_up(cell.realtime.priority, cell.realtime.cpu)
         driver.activate(cell.params.period_ns)
@@ -139,6 +141,14 @@ def _check(caps: DriverCaps, system: System) -> None:
         )
     if CommandKind.POSITION not in caps.kinds:
         raise HandshakeError(f"the robot ({caps.identity}) takes no joint positions", hint="use another driver")
+
+
+def _certified(cell: Cell, system: System) -> None:
+    try:
+        require(cell, system.params)
+    except ConfigError as error:
+        hint = "certify with the limits that this robot tells: asc certify --cell CELL --limits-from LOG"
+        raise HandshakeError("; ".join(error.lines), hint=hint) from error
 
 
 def _complain(error: Exception) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from asc_rt import realtime
+from asc_rt.certified import require
 from asc_rt.config import Cell, ConfigError, load_cell
 from drivers import registry
 from drivers.base import Examinable, Finding
@@ -92,6 +93,19 @@ def _file(cell: Cell) -> Iterator[Finding]:
     yield Finding("cell", True, f"{cell.path.name} is in order")
 
 
+def _certificate(cell: Cell) -> Iterator[Finding]:
+    name = "certificate"
+    if cell.uncertified:
+        yield Finding(name, True, "not asked for: the simulated cell says uncertified = true")
+        return
+    try:
+        require(cell)
+    except ConfigError as error:
+        yield Finding(name, False, "; ".join(error.lines), "asc certify; without one asc run refuses the cell")
+    else:
+        yield Finding(name, True, f"covers tool {cell.params.tool.name} on {cell.params.robot.name}")
+
+
 def _bus_port(cell: Cell) -> Iterator[Finding]:
     host, _, port = cell.bus_endpoint.removeprefix("tcp/").rpartition(":")
     with socket.socket() as probe:
@@ -113,7 +127,7 @@ def _robot(cell: Cell) -> Iterator[Finding]:
             yield found
 
 
-CELL: tuple[Callable[[Cell], Iterator[Finding]], ...] = (_file, _bus_port, _robot)
+CELL: tuple[Callable[[Cell], Iterator[Finding]], ...] = (_file, _certificate, _bus_port, _robot)
 
 
 # --- helpers ---------------------------------------------------------------------------------------------------------

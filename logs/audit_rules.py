@@ -14,6 +14,7 @@ import numpy as np
 from asc_rt.core.rows import nearest_measured
 from asc_rt.core.system import System
 from asc_rt.core.types import CommandKind, EventKind, Health, Mode, Status, StopReason, vector
+from asc_rt.synthesis.certificate import CertificateError, covers, parse
 from logs import audit_wire, schema
 from logs.audit_evidence import Column, Evidence
 from logs.audit_files import closed, completeness, identity, records, seals, signature
@@ -269,10 +270,22 @@ def wire_bytes(e: Evidence) -> Finding:
 
 
 def certificate(e: Evidence) -> Finding:
-    """The certificate covered the mounted tool."""
+    """A certificate was there and covered what was decided with: arm, its limits of the day, tool, index, ranges."""
+    name, p = "certificate", e.log.params
+    simulated = e.log.session.get("simulated") == "true"
     if schema.CERTIFICATE not in e.log.attachments:
-        return skip("certificate", "the cell names none")
-    return skip("certificate", "attached, but its contents are not judged yet")
+        missing = f"none for tool {p.tool.name} on {p.robot.name}"
+        return skip(name, f"{missing}, in simulation") if simulated else Finding(name, False, missing)
+    try:
+        found = parse(e.log.attachments[schema.CERTIFICATE], schema.CERTIFICATE)
+    except CertificateError as error:
+        return Finding(name, False, str(error))
+    if reasons := covers(found, p):
+        told = f"it did not cover the session: {'; '.join(reasons)}"
+        return skip(name, f"{told}; in simulation") if simulated else Finding(name, False, told)
+    b = found.boundary
+    share = f"{b.feasible} of {b.states} states on phi = 0 feasible"
+    return Finding(name, True, f"covers tool {p.tool.name} on {p.robot.name}, k {found.k:g}, {share}")
 
 
 def replayed(e: Evidence) -> Finding:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from asc_rt.config import ROBOTS, TOOLS, Cell
 from asc_rt.fingerprint import fingerprint
+from asc_rt.synthesis.certificate import file_name
 from logs import schema
 
 _CLOCK_NOT_SET = 5  # TIME_ERROR of adjtimex
@@ -42,7 +43,7 @@ def _files(cell: Cell) -> dict[str, Path]:
         "profile.toml": ROBOTS / cell.params.robot.name / "profile.toml",
         "tool.toml": TOOLS / f"{cell.params.tool.name}.toml",
         "calibration": near / str(table.get("human", {}).get("calibration", "")),
-        schema.CERTIFICATE: near / str(table.get("certificate", "")),
+        schema.CERTIFICATE: cell.certificates / file_name(cell.params.robot.name, cell.params.tool.name),
     }
     return {name: path for name, path in files.items() if path.is_file()}
 

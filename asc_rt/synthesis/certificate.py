@@ -16,10 +16,13 @@ from typing import Any
 from asc_rt.core.params import Params, RobotParams, ToolParams
 from asc_rt.synthesis.sampling import Ranges
 
-FORMAT = 1
+FORMAT = 2
 # Of the method: raise it when M, its rate, the index or the sampling changes, so that older certificates become stale.
 # tests/synthesis/test_shipped.py computes the shipped ones' worst states again and tells when.
 METHOD = 1
+
+
+ROUNDING = 1e-6  # share of a limit: what float32 on the wire and degrees may take
 
 
 class CertificateError(Exception):
@@ -33,10 +36,20 @@ class Index(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A robot or a tool."""
+    """A robot, its joint limits left out, or a tool."""
 
     name: str
     sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Joint limits that M was computed with, as of the profile or the smaller ones that the robot told."""
+
+    dq_max: tuple[float, ...]  # rad/s
+    ddq_max: tuple[float, ...]  # rad/s2
+    dddq_max: tuple[float, ...]  # rad/s3
+    effort: tuple[float, ...]  # Nm; (): takes positions
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +101,7 @@ class Boundary:
 class Certificate:
     robot: Part
     tool: Part
+    limits: Limits
     control: str  # "acceleration" or "torque"
     index: Index
     d_min: float  # m
@@ -119,8 +133,19 @@ class Certificate:
 
 
 def hash_of(part: RobotParams | ToolParams) -> str:
-    """SHA-256 of a robot's or a tool's parameters, the URDF text included."""
-    return hashlib.sha256(json.dumps(dataclasses.asdict(part), sort_keys=True).encode()).hexdigest()
+    """SHA-256 of a robot's or a tool's parameters, the URDF text included. Joint limits are compared by value."""
+    limits = {field.name for field in dataclasses.fields(Limits)}
+    values = {key: value for key, value in dataclasses.asdict(part).items() if key not in limits}
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def limits_of(robot: RobotParams) -> Limits:
+    return Limits(robot.dq_max, robot.ddq_max, robot.dddq_max, robot.effort)
+
+
+def with_limits(robot: RobotParams, limits: Limits) -> RobotParams:
+    """`robot` as it was certified."""
+    return dataclasses.replace(robot, **dataclasses.asdict(limits))
 
 
 def part_of(part: RobotParams | ToolParams) -> Part:
@@ -138,6 +163,7 @@ def covers(certificate: Certificate, params: Params) -> list[str]:
             out.append(f"it is for {kind} {mine.name}, not for {mounted.name}")
         elif mine.sha256 != hash_of(mounted):
             out.append(f"it is stale: the data of {kind} {mine.name} have changed since")
+    out += _weaker(c.limits, p.robot)
     for wrong, text in (
         (c.control != p.control, f"it is for {c.control} control, the cell has {p.control} control"),
         (c.index is not Index.PHI_STAR, f"it is for index {c.index}, the cell uses {Index.PHI_STAR}"),
@@ -163,10 +189,27 @@ def covers(certificate: Certificate, params: Params) -> list[str]:
     return out
 
 
+def _weaker(certified: Limits, robot: RobotParams) -> list[str]:
+    """Where the arm can do less than M was computed with. More acceleration, jerk or torque only enlarges U, and with
+    it M; more speed leads to states that were not sampled."""
+    out = []
+    for key, unit, more_is_safe in (
+        ("dq_max", "rad/s", False), ("ddq_max", "rad/s2", True), ("dddq_max", "rad/s3", True), ("effort", "Nm", True),
+    ):  # fmt: skip
+        for joint, (then, now) in enumerate(zip(getattr(certified, key), getattr(robot, key), strict=False)):
+            off = (then - now if more_is_safe else now - then) / then
+            if off > ROUNDING:
+                side = "under" if more_is_safe else "above"
+                name = robot.joints[joint]
+                out.append(f"{key} of {name} is {now:.4g} {unit}, {side} the certified {then:.4g}")
+                break
+    return out
+
+
 def refusals(params: Params, folder: Path) -> list[str]:
     """Why no certificate in `folder` covers `params`, with what to do; empty: one does."""
     file = folder / file_name(params.robot.name, params.tool.name)
-    do = f"asc certify --robot {params.robot.name} --tool {params.tool.name} --control {params.control} -o {file}"
+    do = f"asc certify --cell CELL --tool {params.tool.name} -o {file}"
     if not file.is_file():
         return [f"{file}: missing; no certificate for tool {params.tool.name} on {params.robot.name}; make one: {do}"]
     try:
@@ -194,15 +237,21 @@ def to_json(certificate: Certificate) -> str:
 def load(path: Path) -> Certificate:
     """CertificateError: unreadable, not JSON, or not a certificate of this format."""
     try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
+        return parse(path.read_bytes(), str(path))
     except OSError as error:
         raise CertificateError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def parse(data: bytes, name: str) -> Certificate:
+    """The content of a file called `name`. CertificateError: not JSON, or not a certificate of this format."""
+    try:
+        tree = json.loads(data)
     except ValueError as error:
-        raise CertificateError(f"{path}: not JSON: {error}") from error
+        raise CertificateError(f"{name}: not JSON: {error}") from error
     try:
         return typing.cast(Certificate, _build(Certificate, tree))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CertificateError(f"{path}: not a certificate of format {FORMAT}: {error}") from error
+        raise CertificateError(f"{name}: not a certificate of format {FORMAT}: {error}") from error
 
 
 def _build(kind: Any, value: Any) -> Any:

@@ -14,7 +14,7 @@ from asc_rt.core.abstraction import People, radii, separation
 from asc_rt.core.params import Params, RobotParams, ToolParams
 from asc_rt.core.robot_model import RobotModel
 from asc_rt.synthesis import kernel, sampling, synthesis
-from asc_rt.synthesis.certificate import Boundary, Certificate, Index, Sampled, Worst, part_of
+from asc_rt.synthesis.certificate import Boundary, Certificate, Index, Sampled, Worst, limits_of, part_of, with_limits
 from asc_rt.synthesis.draw import Draw, realise
 from asc_rt.synthesis.sampling import Progress, Pull, Ranges, Survey, Workers
 from asc_rt.synthesis.statistics import Extreme, Statistics
@@ -143,6 +143,7 @@ def _judge(
     return Certificate(
         robot=part_of(r.robot),
         tool=part_of(r.tool),
+        limits=limits_of(r.robot),
         control=r.control,
         index=r.index,
         d_min=r.d_min,
@@ -238,7 +239,7 @@ def _state(model: RobotModel, draw: Draw, why: str, extreme: Extreme) -> Worst:
 
 def recheck(certificate: Certificate, robot: RobotParams, tool: ToolParams) -> list[str]:
     """The recorded worst states computed again by the functions that the cycle calls; why they differ, or empty."""
-    arm = robot_model.load(robot, tool, certificate.control)
+    arm = robot_model.load(with_limits(robot, certificate.limits), tool, certificate.control)
     out = []
     for w in certificate.worst if certificate.ranges.joint_limits else ():
         if w.capsule not in arm.capsule_names:

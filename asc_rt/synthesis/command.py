@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 if TYPE_CHECKING:
+    from asc_rt.core.params import RobotParams
     from asc_rt.synthesis.certify import Request, Result
 
 Show = Callable[[dict[str, Any], bool], None]
@@ -54,6 +55,9 @@ def register(app: typer.Typer, show: Show, refuse: Refuse) -> None:
         torque_box: Annotated[
             bool, typer.Option("--torque-box", help="leave the joint limits out, as the paper")
         ] = False,
+        limits_from: Annotated[
+            Path | None, typer.Option("--limits-from", help="recording whose robot told its own joint limits")
+        ] = None,
         out: Annotated[
             Path | None, typer.Option("-o", "--out", help="certificate to write; default: under runs/")
         ] = None,
@@ -64,6 +68,7 @@ def register(app: typer.Typer, show: Show, refuse: Refuse) -> None:
         from asc_rt.core.robot_model import ModelError
         from asc_rt.synthesis.cluster import ClusterError
         from asc_rt.synthesis.sampling import RangeError
+        from logs.mcap_scan import LogError
 
         given = {
             "index": index, "samples": samples, "seed": seed, "k": k, "required": coverage, "d_range": d_range,
@@ -72,8 +77,10 @@ def register(app: typer.Typer, show: Show, refuse: Refuse) -> None:
         }  # fmt: skip
         try:
             request = make_request(robot, tool, control, cell, **given)
+            if limits_from is not None:
+                request = replace(request, robot=_told_limits(request.robot, limits_from))
             result = run(request, cluster)
-        except (RangeError, ModelError, ClusterError) as error:
+        except (RangeError, ModelError, ClusterError, LogError) as error:
             refuse(str(error))
         file = write(result, out or Path("runs") / f"{request.robot.name}-{request.tool.name}.json")
         for reason in result.certificate.reasons:
@@ -125,6 +132,19 @@ def make_request(robot: str | None, tool: str | None, control: str | None, cell:
         return request
     k = base.safety.k if request.k is None and request.index is Index.PHI_STAR else request.k
     return replace(request, M_floor=base.safety.M_floor, eta=base.safety.eta, period=base.period, k=k)
+
+
+def _told_limits(robot: RobotParams, recording: Path) -> RobotParams:
+    """`robot` with the acceleration, jerk and torque that were decided with there, and its own speed, which is the
+    greater one: nothing that the arm may do is left out. RangeError: another robot; LogError: the file."""
+    from asc_rt.synthesis.certificate import limits_of, with_limits
+    from asc_rt.synthesis.sampling import RangeError
+    from logs.recording import open_recording
+
+    told = open_recording(recording).params.robot
+    if told.name != robot.name:
+        raise RangeError(f"--limits-from: {recording} is of {told.name}, not of {robot.name}")
+    return with_limits(robot, replace(limits_of(told), dq_max=robot.dq_max))
 
 
 def run(request: Request, cluster: str | None) -> Result:

@@ -49,6 +49,8 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
         (["run", "--set", "safety.d_min_m=-0.1"], "-0.1 m is out of range"),
         (["run", "--set", "safety"], "key=value"),
         (["run", "--log", "README.md"], "never overwritten"),
+        (["run", "--set", "tool=ee1"], "certificates/lrmate_200id-ee1.json: missing"),
+        (["run", "--set", "safety.k=2"], "safety.k = 2 is under the certified 3"),
         (["sim", "fanuc", "--port", "99999"], "port"),
         (["replay", "no-such.mcap"], "no-such.mcap"),
         (["replay", "README.md"], "README.md"),

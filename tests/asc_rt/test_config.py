@@ -161,6 +161,12 @@ def test_unreadable_and_unknown_cells(tmp_path: Path) -> None:
     assert "did you mean 'fanuc-sim'" in faults("fanuk-sim")[0]
 
 
+def test_only_a_simulated_cell_may_run_uncertified() -> None:
+    assert load_cell("fanuc-sim", ["uncertified=true"]).uncertified
+    lines = faults("fanuc-sim", "simulated=false", "uncertified=true")
+    assert any("uncertified: this cell is real" in line for line in lines)
+
+
 def test_a_real_cell_has_neither_ground_truth_nor_simulated_devices() -> None:
     lines = faults("fanuc-sim", "simulated=false")
     assert any("ground-truth" in line for line in lines)

@@ -40,7 +40,7 @@ def test_a_good_session_keeps_every_rule(session: Path) -> None:
     report, _ = audit(session, KEY.public_key(), "KEY", sample=40)
     assert [rule["name"] for rule in report["rules"] if not rule["holds"]] == []
     assert report["holds"]
-    assert set(report["not_judged"]) == {"joint torque", "sent bytes", "certificate"}
+    assert set(report["not_judged"]) == {"joint torque", "sent bytes"}
     keys = {"rules", "sealed", "crc_ok", "complete", "cycles", "gaps", "min_distance_m", "worst_phi", "stops"}
     assert keys | {"certificate"} <= set(report)
     assert (report["cycles"], report["crc_ok"], report["complete"], report["gaps"]) == (150, True, True, [])
@@ -308,6 +308,30 @@ def test_a_recovered_file_passes_and_says_so(session: Path, tmp_path: Path) -> N
     assert report["holds"], verdict(report)
     (closed,) = (rule for rule in report["rules"] if rule["name"] == "closed")
     assert closed["detail"] == f"recovered, {found.bytes_cut} bytes cut"
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda e: e.log.attachments.pop(schema.CERTIFICATE), "none for tool drill on lrmate_200id"),
+        (lambda e: e.log.attachments.update({schema.CERTIFICATE: b"{}"}), "not a certificate of format"),
+        (
+            lambda e: setattr(e.log, "params", dataclasses.replace(e.log.params, control="torque")),
+            "for acceleration control",
+        ),
+    ],
+)
+def test_without_a_certificate_only_a_simulated_session_is_in_order(
+    evidence: Evidence, spoil: Callable[[Evidence], None], said: str, simulated: bool
+) -> None:
+    before = rules.certificate(evidence)
+    assert before.holds and not before.skipped and "covers tool drill on lrmate_200id" in before.detail
+    evidence.log.session["simulated"] = str(simulated).lower()
+    spoil(evidence)
+    found = rules.certificate(evidence)
+    assert said in found.detail
+    assert (found.holds, found.skipped) == ((False, False) if "format" in said else (simulated, simulated))
 
 
 def test_the_cycles_around_every_change_are_always_run_again(evidence: Evidence) -> None:

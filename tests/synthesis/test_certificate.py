@@ -40,6 +40,9 @@ def test_a_certificate_covers_the_cell_it_was_made_for(made: c.Certificate, para
     assert c.covers(made, params) == []
     careful = replace(params.safety, k=5.0, activation_distance=0.8, human_acceleration=0.0, eta=0.5, M_floor=1.0)
     assert c.covers(made, replace(params, safety=careful, task=replace(params.task, speed=0.1))) == []
+    r = params.robot
+    strong = replace(r, ddq_max=tuple(2.0 * v for v in r.ddq_max), dq_max=tuple(0.5 * v for v in r.dq_max))
+    assert c.covers(made, replace(params, robot=strong)) == []
 
 
 def safety(**changes: float) -> Callable[[Params], Params]:
@@ -55,9 +58,17 @@ REFUSED: dict[str, tuple[Callable[[Params], Params], str]] = {
         lambda p: replace(p, robot=replace(p.robot, urdf=p.robot.urdf + " ")),
         "data of robot lrmate_200id",
     ),
-    "limits changed": (
+    "less acceleration": (
         lambda p: replace(p, robot=replace(p.robot, ddq_max=tuple(0.9 * v for v in p.robot.ddq_max))),
-        "data of robot lrmate_200id have changed",
+        "ddq_max of J1 is 7.854 rad/s2, under the certified 8.727",
+    ),
+    "less jerk": (
+        lambda p: replace(p, robot=replace(p.robot, dddq_max=(*p.robot.dddq_max[:5], 1.0))),
+        "dddq_max of J6 is 1 rad/s3, under the certified 69.81",
+    ),
+    "more speed": (
+        lambda p: replace(p, robot=replace(p.robot, dq_max=(9.0, *p.robot.dq_max[1:]))),
+        "dq_max of J1 is 9 rad/s, above the certified 7.854",
     ),
     "another tool": (lambda p: replace(p, tool=replace(p.tool, name="bat")), "for tool drill, not for bat"),
     "tool changed": (lambda p: replace(p, tool=replace(p.tool, mass=1.7)), "data of tool drill have changed"),
@@ -107,7 +118,7 @@ def test_the_file_gives_the_same_certificate(made: c.Certificate, tmp_path: Path
 def test_missing_covering_and_broken_files(made: c.Certificate, params: Params, tmp_path: Path) -> None:
     (reason,) = c.refusals(params, tmp_path)
     assert "missing" in reason
-    assert "asc certify --robot lrmate_200id --tool drill" in reason
+    assert "asc certify --cell CELL --tool drill" in reason
     file = tmp_path / c.file_name("lrmate_200id", "drill")
     file.write_text(c.to_json(made))
     assert c.refusals(params, tmp_path) == []
