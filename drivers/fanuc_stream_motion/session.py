@@ -166,7 +166,7 @@ class Session:
         except DriverError:
             self.stop()
             raise
-        return self._sample(t_ns, status)
+        return self._accept(t_ns, status)
 
     def read(self, deadline_ns: int) -> JointState | None:
         if self._phase in (Phase.CLOSED, Phase.CONFIGURED):
@@ -282,14 +282,15 @@ class Session:
         return self._accept(*arrived) if arrived else None
 
     def _accept(self, t_ns: int, status: Status) -> JointState:
+        before, ahead = self._intake.newest, self._intake.take(status)
         self.fault = self.fault or self._intake.fault
         lost = not (status.ready and status.servo_on) or status.emergency_stop or bool(status.trouble)
         if lost and self._phase is Phase.STREAMING:
             self.fault = self.fault or self._diagnose(status)  # what happens after a lost session does not continue it
-        return self._sample(t_ns, status)
+        return self._sample(t_ns, status, before, ahead)
 
-    def _sample(self, t_ns: int, status: Status) -> JointState:
-        before, ahead = self._intake.newest, self._intake.take(status)
+    def _sample(self, t_ns: int, status: Status, before: Status | None, ahead: int) -> JointState:
+        """`status` for the core, `ahead` numbers after the one `before` it."""
         still = np.zeros(DOF)
         dq = vector((status.q - before.q) / (ahead * self._period_ns * 1e-9) if before and ahead else still)
         self._joint = JointState(

@@ -54,9 +54,10 @@ def dip(rig: Rig) -> None:
 ok = End(GOES_ON)
 
 TABLE: dict[str, tuple[Happen, End, End]] = {
-    "1 status lost": (inject("lose_status"), ok, ok),
-    "2 statuses lost": (inject("lose_status", 2), ok, ok),
-    "4 statuses lost (START_MOVE - 1)": (inject("lose_status", 4), ok, ok),
+    **{f"{n} statuses lost": (inject("lose_status", n), ok, ok) for n in (1, 2, 3, 4)},
+    # The command of the cycle is one of the START_MOVE: the simulated robot is the stricter of two readings.
+    "5 statuses lost (START_MOVE)": (inject("lose_status", 5), End(FAULTED, "MOTN-603"), ok),
+    "6 statuses lost": (inject("lose_status", 6), End(FAULTED, "MOTN-603"), ok),
     "8 statuses lost": (inject("lose_status", 8), End(FAULTED, "MOTN-603"), ok),
     "11 statuses lost": (inject("lose_status", 11), End(FAULTED, "MOTN-603"), End(FAULTED)),
     "30 statuses lost": (inject("lose_status", 30), End(FAULTED, "MOTN-603"), End(FAULTED)),
@@ -134,6 +135,8 @@ def check_session(rig: Rig, end: End, joints: list[object], error: Exception | N
         case "faulted":
             assert error is None
             assert rig.driver.fault is not None and rig.driver.fault.hint
+            if end.alarm == "MOTN-603" and rig.driver.counters.missing:
+                assert "probably MOTN-603" in str(rig.driver.fault) or "not answered in time" in str(rig.driver.fault)
             last = joints[-1]
             assert last is not None and RobotFlag.FAULTED in last.flags  # type: ignore[attr-defined]
         case "silent":
@@ -142,15 +145,60 @@ def check_session(rig: Rig, end: End, joints: list[object], error: Exception | N
             assert isinstance(error, ProtocolError)
 
 
+@pytest.mark.parametrize("moving", [False, True], ids=["at rest", "in motion"])
 @pytest.mark.parametrize("wire", [A, B])
-def test_the_sequence_wraps_in_motion(wire: str) -> None:
+def test_the_sequence_wraps(wire: str, moving: bool) -> None:
     rig = Rig(wire)
     rig.begin()
-    rig.moving = True
+    rig.moving = moving
     rig.robot.jump_sequence(2**32 - 100)
     rig.run(250)
     assert rig.numbers()[0] > 2**31 > rig.numbers()[-1]
     assert rig.offences == [] and rig.driver.fault is None
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["at rest", "in motion"])
+@pytest.mark.parametrize(("wire", "jerk"), [(A, 5000.0), (B, 1.25 * 1860.0)])
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_99_percent_of_a_limit_is_sent_and_101_percent_is_not(
+    share: float, wire: str, jerk: float, moving: bool
+) -> None:
+    """J4 at the jerk of the first stage: the wrist alone moves, slowly, and turns about its own axis."""
+    rig = Rig(wire)
+    rig.begin()
+    step = np.radians(jerk) * rig.period_ns**3 * 1e-27
+    along = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    rig.path = lambda k: START + along * 0.25 * step * max(0, k - 20) ** 2 * moving  # type: ignore[method-assign]
+    rig.run(40)
+    rig.read()
+    ahead = rig.path(rig.k) + along * share * step * (0.9999 if share < 1 else 1.0)
+    if share < 1:
+        assert rig.write(ahead).ok
+        rig.driver.stop()
+        assert rig.alarms == [] and rig.offences == []
+        return
+    before = len(rig.commands())
+    with pytest.raises(ProtocolError, match="MOTN-722.*J4 jerk"):
+        rig.write(ahead)
+    assert len(rig.commands()) == before
+    rig.driver.stop()
+    assert rig.alarms == [] and rig.offences == []
+
+
+@pytest.mark.parametrize("wire", [A, B])
+def test_a_first_set_point_away_from_the_arm_is_never_sent_and_would_be_an_alarm(wire: str) -> None:
+    rig = Rig(wire)
+    rig.begin()
+    rig.read()
+    with pytest.raises(ProtocolError, match="MOTN-625.*2 deg from where the arm is"):
+        rig.write(START + np.radians(2.0))
+    assert rig.commands() == []
+    rig.run(1)
+    rig.driver.stop()
+    rig.driver.activate(rig.period_ns)
+    rig.forge([rig.robot.sequence], ahead=2.0)
+    rig.line.run(2)
+    assert rig.alarms == ["MOTN-625"]
 
 
 @pytest.mark.parametrize("wire", [A, B])
