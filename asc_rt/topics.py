@@ -25,13 +25,14 @@ OPERATOR = Topic("cell/operator", "json", 0, Delivery.QUEUE, '{"id": int, "kind"
 GOAL = Topic("cell/goal", "json", 0, Delivery.LATEST, '{"id": int, "q": [rad, ...]}')
 STATE = Topic("cell/state", "json", 10, Delivery.LATEST, "newest cycle, republished by the logger")
 CONTROL = Topic("cell/control", "json", 0, Delivery.QUEUE, "start, end and errors of the control process")
+CAMERA = Topic("cell/camera", "foxglove.CompressedImage", 15, Delivery.QUEUE, "what cameras see; frame_id: which")
 PERSON_TRUTH = Topic("sim/person", "asc.v1.HumanState", 125, Delivery.LATEST, "where the simulated person really is")
 PLANT_TRUTH = Topic("sim/truth", "json", 125, Delivery.LATEST, "what the plant really did: q, dq, distance, contact")
 
 # The simulated devices that a cell may have as [sim.*], and by what one can hear that they run.
 SIM_DEVICES = {"fanuc": PLANT_TRUTH, "human": PERSON_TRUTH}
 
-TOPICS = (HUMAN, OPERATOR, GOAL, STATE, CONTROL, PERSON_TRUTH, PLANT_TRUTH)
+TOPICS = (HUMAN, OPERATOR, GOAL, STATE, CONTROL, CAMERA, PERSON_TRUTH, PLANT_TRUTH)
 
 
 def ready(device: str) -> Topic:

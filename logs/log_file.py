@@ -80,8 +80,10 @@ class LogFile:
         return self._file.size
 
     def message(self, channel: schema.Channel, t_ns: int, data: bytes) -> None:
-        """Add a message of monotonic time `t_ns`."""
+        """Add a message of monotonic time `t_ns`; a channel that is new begins with it."""
         topic = channel.topic
+        if topic not in self._channels:
+            self._channels[topic], self._counts[topic] = self._register(channel), 0
         time_ns = max(0, t_ns + self._wall_minus_monotonic_ns)
         self._writer.message(self._channels[topic], self._counts[topic], time_ns, data)
         self._counts[topic] += 1

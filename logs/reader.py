@@ -123,6 +123,10 @@ class Log:
             return {path: np.zeros(0, self.layout.dtype[path]) for path in paths}
         return {path: np.concatenate([part[path] for part in parts]) for path in paths}
 
+    @property
+    def topics(self) -> frozenset[str]:
+        return frozenset(self._topics.values())
+
     def messages(self, *topics: str) -> Iterator[LogMessage]:
         """The messages of some topics, in the order of the file."""
         wanted = {channel: topic for channel, topic in self._topics.items() if topic in topics}

@@ -58,6 +58,10 @@ class Recording:
             sha.update(memoryview(part.data))
         return sha.hexdigest()
 
+    @property
+    def topics(self) -> frozenset[str]:
+        return frozenset().union(*(part.topics for part in self.parts))
+
     def record(self, index: int) -> bytes:
         """The bytes of cycle record `index`, counted from 0 over all files."""
         if not 0 <= index < self.cycles:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf.message import DecodeError
 
 from asc_rt import human_state_pb2, record
 
@@ -82,7 +84,7 @@ def parse_wire_message(message: bytes) -> tuple[int, int, bytes]:
 
 
 def _foxglove_file() -> descriptor_pb2.FileDescriptorProto:
-    """FrameTransforms and Log of Foxglove's schemas: the fields that we fill, under their numbers."""
+    """FrameTransforms, Log and CompressedImage of Foxglove's schemas: the fields that we fill, under their numbers."""
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="foxglove/asc.proto", package="foxglove", syntax="proto3")
     file.dependency.append("google/protobuf/timestamp.proto")
@@ -106,6 +108,10 @@ def _foxglove_file() -> descriptor_pb2.FileDescriptorProto:
     )  # fmt: skip
     message("FrameTransforms", transforms=(1, inner, ".foxglove.FrameTransform"))
     level_type = (field.TYPE_ENUM, ".foxglove.LogLevel")
+    message(
+        "CompressedImage", timestamp=(1, *stamp), data=(2, field.TYPE_BYTES, ""), format=(3, *text),
+        frame_id=(4, *text),
+    )  # fmt: skip
     message("Log", timestamp=(1, *stamp), level=(2, *level_type), message=(3, *text), name=(4, *text))
     return file
 
@@ -122,6 +128,7 @@ def _timestamp_file() -> descriptor_pb2.FileDescriptorProto:
 _FOXGLOVE = _file_set(_timestamp_file(), _foxglove_file())
 FrameTransforms = _message_class("foxglove.FrameTransforms", _timestamp_file(), _foxglove_file())
 _Log = _message_class("foxglove.Log", _timestamp_file(), _foxglove_file())
+CompressedImage = _message_class("foxglove.CompressedImage", _timestamp_file(), _foxglove_file())
 
 
 def log_message(wall_ns: int, level: str, text: str) -> bytes:
@@ -170,7 +177,23 @@ TRANSFORMS = Channel("/tf", "protobuf", "foxglove.FrameTransforms", _FOXGLOVE)
 LOG = Channel("/log", "protobuf", "foxglove.Log", _FOXGLOVE)
 JOINT_STATES = Channel("/joint_states", "cdr", "sensor_msgs/msg/JointState", _JOINT_STATE)
 ROBOT_DESCRIPTION = Channel("/robot_description", "cdr", "std_msgs/msg/String", b"string data\n")
+CAMERAS = "/cell/camera/"  # and the camera's name: one channel each, from its first image on
 HELLO = Channel("/session")  # one message before all others, so that the schemas are on disk from the first moment
+
+_CAMERA_NAME = re.compile(r"[a-z0-9_-]{1,32}")
+
+
+def camera(image: bytes) -> Channel | None:
+    """The channel of a foxglove.CompressedImage: depth as 16-bit PNG, or colour; its frame_id names the camera. None:
+    no such image."""
+    try:
+        name = CompressedImage.FromString(image).frame_id
+    except DecodeError:
+        return None
+    if not _CAMERA_NAME.fullmatch(name):
+        return None
+    return Channel(CAMERAS + name, "protobuf", "foxglove.CompressedImage", _FOXGLOVE)
+
 
 DRAWN = (ROBOT_DESCRIPTION, TRANSFORMS, JOINT_STATES, LOG)  # for viewers that know nothing of us
 CHANNELS = (CYCLE, WIRE_RX, WIRE_TX, HUMAN, OPERATOR, GOAL, CONTROL, DROPOUT, TRUTH, HELLO, *DRAWN)

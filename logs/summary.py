@@ -36,7 +36,7 @@ def summarise(path: str | Path) -> dict[str, Any]:
     """JSON-able; None where the log cannot tell. LogError: the file."""
     log = open_recording(path)
     c = log.columns(*_COLUMNS)
-    truth = _Truth(log)
+    truth = _Truth(log, c["inputs.t_ns"])
     truth_distance = truth.distance[np.isfinite(truth.distance)]
     measured = c["outputs.decision.d_measured"]
     distances = truth_distance if len(truth.distance) else measured[np.isfinite(measured)]
@@ -129,11 +129,13 @@ def _percentiles(ns: Column) -> dict[str, float | None]:
 
 
 class _Truth:
-    """What the simulated plant says really happened; empty for a real robot."""
+    """What the simulated plant says really happened while the session ran; empty for a real robot."""
 
-    def __init__(self, log: Recording) -> None:
+    def __init__(self, log: Recording, t_ns: Column) -> None:
+        begin, end = (int(t_ns[0]), int(t_ns[-1])) if len(t_ns) else (0, -1)  # the plant is there before and after
         try:
-            rows = [json.loads(message.data) for message in log.messages(schema.TRUTH.topic)]
+            told = (m for m in log.messages(schema.TRUTH.topic) if begin <= m.t_ns <= end)
+            rows = [json.loads(message.data) for message in told]
             far = math.inf
             self.distance = np.array([far if r["distance_m"] is None else r["distance_m"] for r in rows], float)
             self.approach = np.array([r["approach_m_s"] for r in rows], float)

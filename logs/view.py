@@ -62,7 +62,9 @@ def write_rrd(log: Recording, path: Path, moment_ns: int, picture: bool = False)
     recording = new_recording(log.path.stem)
     recording.save(path)
     seen = focus(log, moment_ns, round(WINDOW_S * 1e9))
-    recording.send_blueprint(layout(log.params, (end_ns - start_ns) * 1e-9, seen.joint, seen.towards, picture=picture))
+    cameras = sorted(topic.removeprefix("/cell/") for topic in log.topics if topic.startswith(schema.CAMERAS))
+    length_s = (end_ns - start_ns) * 1e-9
+    recording.send_blueprint(layout(log.params, length_s, seen.joint, seen.towards, picture, cameras))
     canvas = Canvas(recording, log.params, start_ns, math.ceil(log.cycles / SCENE_CYCLES))
     chronicle = Chronicle(canvas)
     events: list[Event] = []
@@ -73,6 +75,7 @@ def write_rrd(log: Recording, path: Path, moment_ns: int, picture: bool = False)
             events += chronicle.draw(now, following)
             bar.update(len(now))
     _draw_truth(canvas, log, start_ns, end_ns)
+    _draw_cameras(canvas, log, start_ns, end_ns)
     events += draw_near_misses(canvas, nearest_moments(log))
     events.append(ending(log, end_ns))
     draw_events(canvas, events)
@@ -92,6 +95,15 @@ def _draw_truth(canvas: Canvas, log: Recording, start_ns: int, end_ns: int) -> N
     if within.any():
         columns = rr.Scalars.columns(scalars=distance[within])
         canvas.recording.send_columns(TRUE_DISTANCE, [canvas.time(t_ns[within])], columns)
+
+
+def _draw_cameras(canvas: Canvas, log: Recording, start_ns: int, end_ns: int) -> None:
+    """What the cameras saw; depth images in metres."""
+    for topic in sorted(topic for topic in log.topics if topic.startswith(schema.CAMERAS)):
+        for message in log.messages(topic):
+            if start_ns <= message.t_ns <= end_ns:
+                image = schema.CompressedImage.FromString(message.data)
+                canvas.image(topic.removeprefix("/cell/"), message.t_ns, image.format, image.data)
 
 
 def _extent(log: Recording) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from logs.view_layout import APPLICATION, BLUE, FLOOR_Z, ORANGE, TIMELINE, log_s
 Array = np.ndarray[Any, Any]
 Records = np.ndarray[Any, np.dtype[np.void]]
 
+PNG_GREY_16 = b"\x10\x00"  # bit depth and colour type in the header
 ROWS = 1000  # cycles in one block
 DECISION, PAIRS, HUMAN = "outputs.decision", "outputs.decision.pairs", "inputs.human"
 PERSON, TOOL_COLOUR, PEDESTAL = (214, 158, 120, 255), (200, 70, 60, 255), (58, 60, 66, 255)
@@ -96,6 +97,14 @@ class Canvas:
 
     def time(self, t_ns: Array) -> rr.TimeColumn:
         return rr.TimeColumn(TIMELINE, duration=(t_ns - self._t0_ns).astype("timedelta64[ns]"))
+
+    def image(self, entity: str, t_ns: int, form: str, data: bytes) -> None:
+        """`form`: "png" with 16 bits of grey is depth in mm; anything else is what it looks like."""
+        self.recording.set_time(TIMELINE, duration=(t_ns - self._t0_ns) * 1e-9)
+        if form == "png" and data[24:26] == PNG_GREY_16:
+            self.recording.log(entity, rr.EncodedDepthImage(data, media_type="image/png", meter=1000.0))
+        else:
+            self.recording.log(entity, rr.EncodedImage(contents=data, media_type=f"image/{form}"))
 
     def draw(self, now: Records, following: Records) -> None:
         """Scene and plots of the cycles `now`; `following`: the cycle after each of them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -83,20 +84,27 @@ LIVE_S = 60.0  # what the plots of the whole session show while it goes on
 
 
 def layout(
-    params: Params, duration_s: float | None, joint: int = 0, towards: float = 0.0, picture: bool = False
+    params: Params,
+    duration_s: float | None,
+    joint: int = 0,
+    towards: float = 0.0,
+    picture: bool = False,
+    cameras: Sequence[str] = (),
 ) -> rrb.Blueprint:
     """Left: the scene, the whole session, what happened. Right: the seconds around the cursor.
 
     `joint`: index of the one whose control is in front. `towards`: direction of the person from the base, rad from x;
     the eye looks across it. `duration_s`: of the session; None: it goes on, and the cursor follows the newest cycle.
-    `picture`: without menus.
+    `picture`: without menus. `cameras`: entities with images, shown beside the scene.
     """
     live = duration_s is None
     window = _around_cursor(-2.0 * WINDOW_S, 0.0) if live else _around_cursor(-WINDOW_S, WINDOW_S)
     session = _around_cursor(-LIVE_S, 0.0) if duration_s is None else _absolute(0.0, duration_s)
     reach = 1.2 * params.safety.activation_distance
     whole = _plot("distance, whole session, m", DISTANCES, session, (-0.1, reach))
-    left = rrb.Vertical(_scene(towards), whole, _states(session), _events(), row_shares=[6.0, 1.4, 1.7, 1.7])
+    eyes = [rrb.Spatial2DView(name=entity, origin=f"/{entity}") for entity in cameras]
+    scene = rrb.Horizontal(_scene(towards), rrb.Vertical(*eyes), column_shares=[3.0, 1.0]) if eyes else _scene(towards)
+    left = rrb.Vertical(scene, whole, _states(session), _events(), row_shares=[6.0, 1.4, 1.7, 1.7])
     single = {name: _plot(title, [f"+ /plot/{name}"], window) for name, (title, _) in PLOTS.items()}
     single["distance"] = _plot(PLOTS["distance"][0], DISTANCES, window, (-0.1, reach / 2), legend=True)
     control = rrb.Tabs(

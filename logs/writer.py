@@ -36,6 +36,7 @@ from logs.session_files import SessionFiles
 POLL_S = 0.05
 FLUSH_NS = 50_000_000  # what a crash of the machine may cost
 STATE_NS = 100_000_000
+MAX_CAMERAS = 8  # an open bus must not fill the file with channels
 MAX_TAKE = 1000  # messages of one key in one poll: a flood must not keep the cycles waiting
 ORPHAN_NS = 1_000_000_000  # without a supervisor and without new cycles for this long, the session is over
 
@@ -68,9 +69,12 @@ class Logger:
         self._cycles, self._wire, self._display = cycles, wire, display
         self._t_offset = layout.dtype.fields["inputs.t_ns"][1]  # type: ignore[index]
         self._inboxes: list[tuple[Latest | Queue, schema.Channel]] = []
+        self._images: Queue | None = None
+        self._cameras: set[str] = set()
         self._state: Publisher | None = None
         if bus is not None:
             self._inboxes = [(bus.queue(topic.key), channel) for topic, channel in BUS_CHANNELS]
+            self._images = bus.queue(topics.CAMERA.key)
             self._state = bus.publisher(topics.STATE.key)
         self._lost = {"cycle": 0, "wire": 0}
         self._newest: bytes | None = None
@@ -114,6 +118,7 @@ class Logger:
         self._take_cycles()
         self._take_wire()
         self._take_bus()
+        self._take_images()
         self._count_losses()
         if now_ns >= self._next_flush_ns and self.failure is None:
             self._log.flush()
@@ -170,6 +175,17 @@ class Logger:
                     self._log.message(channel, self._clock(), data)
                     if channel is schema.CONTROL:
                         self._keep_decided(data)
+
+    def _take_images(self) -> None:
+        for _ in range(MAX_TAKE):
+            if self._images is None or (data := self._images.take()) is None:
+                return
+            channel = schema.camera(data)
+            if channel is None or self.failure is not None:
+                continue
+            if channel.topic in self._cameras or len(self._cameras) < MAX_CAMERAS:
+                self._cameras.add(channel.topic)
+                self._log.message(channel, self._clock(), data)
 
     def _keep_decided(self, data: bytes) -> None:
         """The control process tells what it really decides with, the robot's own limits included: replay needs that."""

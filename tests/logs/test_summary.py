@@ -17,10 +17,13 @@ KEYS = {
 }  # fmt: skip
 
 
+T0_NS = 5_000_000_000  # of the first cycle, as the fixture dates it
+
+
 def truth(*rows: tuple[float | None, float]) -> list[Any]:
     """(distance, approach speed) of the simulated plant, one each period."""
     return [
-        (schema.TRUTH, k, {"distance_m": distance, "approach_m_s": approach, "contact": distance == 0.0})
+        (schema.TRUTH, T0_NS + k, {"distance_m": distance, "approach_m_s": approach, "contact": distance == 0.0})
         for k, (distance, approach) in enumerate(rows)
     ]
 
@@ -79,6 +82,15 @@ def test_only_what_the_robot_does_is_its_violation(recording: Any, rows: list[An
     assert recording.params.safety.d_min == pytest.approx(0.1)
     found = summarise(recording.write(recording.packed(recording.cycles(5)), truth(*rows)))
     assert found["robot_caused_violations"] == violations
+
+
+def test_what_happened_before_and_after_the_session_is_not_its_own(recording: Any) -> None:
+    cycles = recording.cycles(5)
+    near = {"distance_m": 0.01, "approach_m_s": 0.5, "contact": True}
+    far = {"distance_m": 0.7, "approach_m_s": 0.0, "contact": False}
+    truth = [(schema.TRUTH, T0_NS + offset, told) for offset, told in ((-(10**9), near), (1000, far), (10**9, near))]
+    found = summarise(recording.write(recording.packed(cycles), truth))
+    assert (found["min_distance_m"], found["robot_caused_violations"], found["contacts"]) == (0.7, 0, 0)
 
 
 def test_contacts_are_counted(recording: Any) -> None:
@@ -141,6 +153,6 @@ def test_an_empty_session_has_a_summary(recording: Any) -> None:
 
 
 def test_truth_that_is_none_is_one_clear_line(recording: Any) -> None:
-    path = recording.write(recording.packed(recording.cycles(5)), [(schema.TRUTH, 1, {"foreign": 1})])
+    path = recording.write(recording.packed(recording.cycles(5)), [(schema.TRUTH, T0_NS + 1, {"foreign": 1})])
     with pytest.raises(LogError, match="/sim/truth"):
         summarise(path)

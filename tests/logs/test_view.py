@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -23,7 +24,7 @@ from logs.view import view, write_rrd
 from logs.view_columns import Canvas, in_blocks, new_recording
 from logs.view_events import Event, changes, draw_near_misses, nearest_moments
 from logs.view_geometry import Segments, connecting_lines, poses
-from logs.view_layout import AMBER, GREEN, RED, phi_colours
+from logs.view_layout import AMBER, GREEN, RED, layout, phi_colours
 from logs.view_live import Painter
 from logs.view_process import ViewError
 
@@ -316,6 +317,22 @@ def test_blocks_overlap_by_one_cycle_and_lose_none() -> None:
     blocks = list(in_blocks(np.split(numbers, [1, 7, 7, 30, 31, 90]), rows=10))  # type: ignore[arg-type]
     assert np.concatenate([block[:-1] for block in blocks]).tolist() == numbers[:-1].tolist()
     assert np.concatenate([block[1:] for block in blocks]).tolist() == numbers[1:].tolist()
+
+
+def test_camera_images_are_shown_beside_the_scene(recording: Any, tmp_path: Path) -> None:
+    depth = cv2.imencode(".png", np.full((4, 6), 1500, np.uint16))[1].tobytes()
+    colour = cv2.imencode(".jpg", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
+    out = new_recording("x")
+    out.save(tmp_path / "x.rrd")
+    canvas = Canvas(out, recording.params, 0)
+    canvas.image("camera/left", 2_000_000_000, "png", depth)
+    canvas.image("camera/right", 3_000_000_000, "jpeg", colour)
+    out.disconnect()
+    found = content(tmp_path / "x.rrd")
+    assert found["camera/left"]["t"] == [2.0]
+    assert found["camera/left"]["meter"] == [[1000.0]]  # depth
+    assert "blob" in found["camera/right"] and "meter" not in found["camera/right"]
+    assert layout(recording.params, 1.0, cameras=("camera/left",)) is not None
 
 
 def test_a_thinned_scene_keeps_the_nearest_cycle(recording: Any, tmp_path: Path) -> None:

@@ -171,6 +171,10 @@ def test_the_process_records_a_session(recording: Any, session_ring: Path, tmp_p
                 cycles.put(record)
             bus.publisher(topics.HUMAN.key).put(human)
             bus.publisher(topics.PLANT_TRUTH.key).put_json({"distance_m": None, "approach_m_s": 0.0, "contact": False})
+            for name in ("left", "left", "no good name", "right"):
+                image = schema.CompressedImage(frame_id=name, format="png", data=b"image of " + name.encode())
+                bus.publisher(topics.CAMERA.key).put(image.SerializeToString())
+            bus.publisher(topics.CAMERA.key).put(b"\xff")
             bus.event_publisher(topics.OPERATOR.key).put_json({"id": 1, "kind": "ARM"})
             wait_until(lambda: '"tick": 39' in (state.take() or b"").decode())
             wait_until(lambda: b"".join(m.data for m in open_log(out).messages("/cell/operator")))
@@ -188,6 +192,9 @@ def test_the_process_records_a_session(recording: Any, session_ring: Path, tmp_p
     assert [m.data for m in log.messages("/cell/human")] == [human]
     assert [json.loads(m.data)["id"] for m in log.messages("/cell/operator")] == [1]
     assert len(list(log.messages("/sim/truth"))) == 1
+    assert sorted(t for t in log.topics if t.startswith(schema.CAMERAS)) == ["/cell/camera/left", "/cell/camera/right"]
+    seen = [schema.CompressedImage.FromString(m.data) for m in log.messages("/cell/camera/left")]
+    assert [(image.format, image.data) for image in seen] == [("png", b"image of left")] * 2
     assert not log.truncated
     assert log.end["reason"] == ("terminated" if ending == "terminated" else "session closed")
     assert np.frombuffer(log.record(39), log.layout.dtype)["inputs.tick"] == 39
