@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from asc_rt import topics
 from asc_rt.cell_files import CellFile, ProfileFile, ToolFile
 from asc_rt.explain import suggestion
+from calibration.result import CalibrationError, load
 from drivers import registry
 
 GROUND_TRUTH = "ground-truth"
@@ -138,13 +138,23 @@ def calibration_hash(path: Path, cell: CellFile, faults: Faults) -> int:
             wrong = f"{GROUND_TRUTH!r} exists in simulation only"
             faults.note(path, "human.calibration", f"{wrong}; the sensor's calibration file")
         return 0
-    file = path.parent / cell.human.calibration
-    try:
-        return hash_number(hashlib.sha256(file.read_bytes()).digest())
-    except OSError as error:
-        wrong = f"{file}: {error.strerror}"
-        faults.note(path, "human.calibration", f"{wrong}; the sensor's calibration file, or {GROUND_TRUTH!r}")
+    return _result_number(path, cell, faults)
+
+
+def _result_number(path: Path, cell: CellFile, faults: Faults) -> int:
+    """The hash of the camera's result file, if it is accepted, valid today and made for the camera of this cell."""
+    human, file = cell.human, path.parent / cell.human.calibration
+    if not cell.simulated and not (human.camera and human.camera_mode):
+        faults.note(path, "human.camera", "a real cell names serial and camera_mode of the camera it is calibrated for")
         return 0
+    serials = {"camera": human.camera} if human.camera else {}
+    try:
+        result = load(file, "hand-eye", serials, human.camera_mode or None)
+    except CalibrationError as error:
+        for line in error.lines:
+            faults.note(path, "human.calibration", line)
+        return 0
+    return hash_number(result.digest)
 
 
 def hash_number(digest: bytes) -> int:

@@ -45,6 +45,8 @@ class Human(Table):
     age_limit_ms: Annotated[float, _number(10, 1000)]
     future_limit_ms: Annotated[float, _number(0, 100)]
     calibration: Text  # "ground-truth", or a calibration file
+    camera: str = ""  # serial number that the calibration must belong to; empty in a simulated cell: any
+    camera_mode: str = ""  # "1280x720"
 
 
 class Safety(Table):

@@ -19,6 +19,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from asc_rt.synthesis import command as synthesis
+from calibration import command as calibration
 from logs import commands
 
 DEFAULT_CELL = "fanuc-sim"
@@ -267,6 +268,7 @@ def _limit_blas() -> None:
 
 commands.register(app, _show, _refuse, lambda: _limit_blas())
 synthesis.register(app, _show, _refuse)
+calibration.register(app, _show, _refuse)
 
 if __name__ == "__main__":
     main()

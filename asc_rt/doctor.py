@@ -106,6 +106,13 @@ def _certificate(cell: Cell) -> Iterator[Finding]:
         yield Finding(name, True, f"covers tool {cell.params.tool.name} on {cell.params.robot.name}")
 
 
+def _calibration(cell: Cell) -> Iterator[Finding]:
+    """A file that must not be used is refused with the cell; here is what was found good."""
+    number = cell.params.human.calibration_hash
+    detail = f"result file {number:016x} is accepted and valid" if number else "ground truth of the simulation"
+    yield Finding("calibration", True, detail)
+
+
 def _bus_port(cell: Cell) -> Iterator[Finding]:
     host, _, port = cell.bus_endpoint.removeprefix("tcp/").rpartition(":")
     with socket.socket() as probe:
@@ -127,7 +134,7 @@ def _robot(cell: Cell) -> Iterator[Finding]:
             yield found
 
 
-CELL: tuple[Callable[[Cell], Iterator[Finding]], ...] = (_file, _certificate, _bus_port, _robot)
+CELL: tuple[Callable[[Cell], Iterator[Finding]], ...] = (_file, _calibration, _certificate, _bus_port, _robot)
 
 
 # --- helpers ---------------------------------------------------------------------------------------------------------

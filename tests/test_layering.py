@@ -113,7 +113,7 @@ def test_a_driver_knows_neither_bus_nor_log(module: str) -> None:
         ("can", ["drivers/can/", "sim_hil/"]),
         ("mujoco", ["sim_hil/"]),
         ("pydantic", ["asc_rt/cell_files.py", "asc_rt/config.py", "asc_rt/explain.py"]),
-        ("typer", ["asc_rt/cli.py", "asc_rt/synthesis/command.py", "logs/commands.py"]),
+        ("typer", ["asc_rt/cli.py", "calibration/command.py", "asc_rt/synthesis/command.py", "logs/commands.py"]),
     ],
 )
 def test_each_library_is_imported_where_it_lives(module: str, homes: list[str]) -> None:
