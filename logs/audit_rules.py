@@ -20,7 +20,7 @@ from logs.audit_evidence import Column, Evidence
 from logs.audit_files import closed, completeness, identity, records, seals, signature
 from logs.audit_finding import Finding, Rule, skip
 from logs.summary import APPROACH_M_S, stops
-from logs.wire import packets
+from logs.wire import driver_of, packets
 
 ROUNDING = 1e-5  # share of a limit that rounding may take: the gate allows as much
 REST_STEP = 1e-9  # rad in one cycle: a set-point that stands still
@@ -250,7 +250,8 @@ def armed(e: Evidence) -> Finding:
 def wire_bytes(e: Evidence) -> Finding:
     """Every sent packet, decoded independently of the driver, says the recorded command."""
     name = "sent bytes"
-    if f'"{audit_wire.STREAM_MOTION}"' not in e.log.session.get("driver", ""):
+    decode = audit_wire.DECODERS.get(driver_of(e.log))
+    if decode is None:
         return skip(name, "there is no independent decoder for this driver")
     _, sent = packets(e.log)
     if not sent:
@@ -258,7 +259,7 @@ def wire_bytes(e: Evidence) -> Finding:
     claims = np.flatnonzero((e.c["receipt.present"] == 1) & (e.c["receipt.ok"] == 1))
     worst, at = 0.0, 0
     for i in claims:
-        told = audit_wire.set_point(sent.get(int(e.c["receipt.t_tx_ns"][i]), b""))
+        told = decode(sent.get(int(e.c["receipt.t_tx_ns"][i]), b""))
         same = told is not None and told.seq == e.c["receipt.seq"][i]
         off = float(np.abs(told.q - e.c["outputs.command.q"][i]).max()) if told is not None and same else math.inf
         if not off <= worst:

@@ -76,6 +76,14 @@ def _among(times: Column, packets: dict[int, bytes]) -> Column:
     return found
 
 
+def driver_of(log: Recording) -> str:
+    """Name of the driver that the session had; "": none that can be read."""
+    try:
+        return str(json.loads(log.session.get("driver", "{}"))["name"])
+    except (ValueError, KeyError, TypeError):
+        return ""
+
+
 def codec_of(log: Recording) -> ReplayCodec | None:
     """The codec of the driver that the session had."""
     try:

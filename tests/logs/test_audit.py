@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from asc_rt.core.types import CommandKind, Mode, StopReason
+from asc_rt.core.types import CommandKind, Mode, StopReason, vector
+from drivers.registry import driver_class
 from logs import audit_rules as rules
-from logs import schema, seal
+from logs import audit_wire, schema, seal
 from logs.audit import audit, chosen, with_hash
 from logs.audit_evidence import Evidence, gather
 from logs.commands import verdict
@@ -274,6 +275,31 @@ def test_sent_bytes_are_decoded_independently(wire_session: Callable[..., Path],
     found = rules.wire_bytes(gather(open_recording(wire_session(spoil))))
     assert found.holds == (byte is None)
     assert not found.skipped
+
+
+@pytest.mark.parametrize(
+    ("driver", "options", "flip"),
+    [
+        ("fanuc-j519", {"version": 3}, 18),
+        ("fanuc-stream-motion-b", {}, 13),
+        ("fanuc-stream-motion-b", {}, 14),
+        ("fanuc-stream-motion-b", {}, 0),
+    ],
+)
+def test_each_decoder_agrees_with_the_codec_it_shares_nothing_with(
+    driver: str, options: dict[str, Any], flip: int
+) -> None:
+    codec: Any = driver_class(driver)({"host": "127.0.0.1", **options})
+    q = vector(np.linspace(-1.2, 1.3, 6))
+    data = codec.encode_set_point(4711, q, True)
+    told = audit_wire.DECODERS[driver](data)
+    assert told is not None and (told.seq, told.last) == (4711, True)
+    np.testing.assert_allclose(told.q, q, atol=audit_wire.ROUNDING)
+    broken = bytearray(data)
+    broken[flip] ^= 0x41
+    assert audit_wire.DECODERS[driver](bytes(broken)) is None
+    assert audit_wire.DECODERS[driver](data[:-1]) is None
+    assert audit_wire.DECODERS[driver](b"") is None
 
 
 # --- whole files -----------------------------------------------------------------------------------------------------
