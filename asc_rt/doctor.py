@@ -61,6 +61,14 @@ def _priority() -> Finding:
     return Finding("priority", allowed, f"SCHED_FIFO {'allowed' if allowed else f'refused (limit {limit})'}", fix)
 
 
+def _throttling() -> Finding:
+    """Told, not refused, as the kernel is: it takes a core that real-time tasks fill to begin with."""
+    runtime, period = (int(_read(f"/proc/sys/kernel/sched_rt_{name}_us", "-1")) for name in ("runtime", "period"))
+    free = runtime < 0 or runtime >= period
+    held = f"real-time tasks that fill a core are held back {(period - runtime) * 1e-3:.0f} ms in each second"
+    return Finding("throttling", True, "real-time tasks are never held back" if free else held)
+
+
 def _memory_lock() -> Finding:
     limit = realtime.lock_memory_limit()
     enough = limit < 0 or limit >= 1 << 30
@@ -83,7 +91,15 @@ def _shared_memory() -> Finding:
     )
 
 
-PC: tuple[Callable[[], Finding], ...] = (_processor, _kernel, _priority, _memory_lock, _clock, _shared_memory)
+PC: tuple[Callable[[], Finding], ...] = (
+    _processor,
+    _kernel,
+    _priority,
+    _throttling,
+    _memory_lock,
+    _clock,
+    _shared_memory,
+)
 
 
 # --- the cell --------------------------------------------------------------------------------------------------------
