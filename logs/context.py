@@ -11,13 +11,17 @@ import platform
 import subprocess
 import time
 import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from asc_rt.config import ROBOTS, TOOLS, Cell
 from asc_rt.fingerprint import fingerprint
 from asc_rt.synthesis.certificate import file_name
 from logs import schema
 
+NAMING = ("human", "perception", "driver")  # never [log]: its `key` is secret, and a recording is handed around
 _CLOCK_NOT_SET = 5  # TIME_ERROR of adjtimex
 
 
@@ -36,16 +40,36 @@ def attachments(cell: Cell) -> dict[str, bytes]:
 
 
 def _files(cell: Cell) -> dict[str, Path]:
-    """The files that the cell speaks of and that exist."""
-    table = tomllib.loads(cell.text)
-    near = cell.path.parent
+    """The files that the cell consists of and that exist."""
+    folder = ROBOTS / cell.params.robot.name
     files = {
-        "profile.toml": ROBOTS / cell.params.robot.name / "profile.toml",
+        "profile.toml": folder / "profile.toml",
         "tool.toml": TOOLS / f"{cell.params.tool.name}.toml",
-        "calibration": near / str(table.get("human", {}).get("calibration", "")),
         schema.CERTIFICATE: cell.certificates / file_name(cell.params.robot.name, cell.params.tool.name),
     }
+    meshes = {str(mesh.get("filename")) for mesh in ET.fromstring(cell.params.robot.urdf).iter("mesh")}
+    files |= {f"mesh/{name}": folder / name for name in meshes}
+    files |= {key: cell.path.parent / name for key, name in _texts(cell).items()}
     return {name: path for name, path in files.items() if path.is_file()}
+
+
+def _texts(cell: Cell) -> dict[str, str]:
+    """Every text of the tables that may name files, such as a calibration, by its dotted key, overrides applied."""
+    tables = {name: table for name, table in tomllib.loads(cell.text).items() if name in NAMING}
+    texts = dict(_flat(tables))
+    for item in cell.overrides:
+        key, _, value = item.partition("=")
+        if key.strip().split(".")[0] in NAMING:
+            texts[key.strip()] = value.strip().strip("\"'")
+    return texts
+
+
+def _flat(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{key}.")
+        elif isinstance(value, str):
+            yield before + key, value
 
 
 def session(cell: Cell) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """A recording opens in viewers that know nothing of us: their own loaders are asked."""
 
+import dataclasses
 import struct
 import subprocess
 import sys
@@ -134,3 +135,30 @@ def test_meta_data_and_attachments_are_complete(drawn: tuple[Path, list[Any]]) -
     assert b"name" in names["profile.toml"] and b"mass_kg" in names["tool.toml"]
     assert b"numpy==" in names["packages.txt"]
     assert {"operator", "git_commit", "host", "cell", "session_id"} <= set(told["session"])
+
+
+def test_every_file_that_the_cell_names_is_attached_and_no_secret(recording: Any, tmp_path: Path) -> None:
+    (tmp_path / "eye.json").write_text("hand-eye")
+    (tmp_path / "log.key").write_text("secret")
+    text = '[human]\ncalibration = "eye.json"\n[driver]\nname = "x"\ntable = "missing.csv"\n[log]\nkey = "log.key"\n'
+    cell = dataclasses.replace(recording.cell, path=tmp_path / "cell.toml", text=text, overrides=())
+    found = attachments(cell)
+    assert found["human.calibration"] == b"hand-eye"
+    assert b"secret" not in found.values() and "driver.table" not in found
+    other = tmp_path / "other.json"
+    other.write_text("newer")
+    found = attachments(dataclasses.replace(cell, overrides=(f"human.calibration={other}",)))
+    assert found["human.calibration"] == b"newer"
+
+
+def test_meshes_of_the_arm_are_attached(recording: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = recording.params.robot
+    monkeypatch.setattr("logs.context.ROBOTS", tmp_path)
+    (tmp_path / robot.name / "meshes").mkdir(parents=True)
+    (tmp_path / robot.name / "meshes/a.stl").write_bytes(b"shape")
+    urdf = robot.urdf.replace(
+        "</robot>",
+        '<link name="m"><visual><geometry><mesh filename="meshes/a.stl"/></geometry></visual></link></robot>',
+    )
+    params = dataclasses.replace(recording.params, robot=dataclasses.replace(robot, urdf=urdf))
+    assert attachments(dataclasses.replace(recording.cell, params=params))["mesh/meshes/a.stl"] == b"shape"
