@@ -76,8 +76,13 @@ def a_bound(M_min: float) -> float | None:
 
 
 def approach_speed(d: float, d_min: float, k: float, M: float) -> float:
-    """Speed on phi* = 0 at distance d, m/s."""
-    return (d * d - d_min * d_min) * M / k
+    """Speed on phi* = 0 at distance d, m/s: the greatest that it allows."""
+    return max(0.0, d * d - d_min * d_min) * M / k
+
+
+def stopping_speed(d: float, d_min: float, a: float) -> float:
+    """The same on phi_b = 0; a: certified deceleration, m/s2."""
+    return math.sqrt(2.0 * a * max(0.0, d - d_min))
 
 
 @dataclass(frozen=True, slots=True)
