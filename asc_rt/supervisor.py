@@ -21,7 +21,7 @@ from asc_rt.core.types import EventKind
 from asc_rt.processes import Death, Process, Processes, Spec, describe, table
 from asc_rt.record import RecordLayout
 
-READY_TIMEOUT_S = 60.0  # of one process, compiling included
+READY_TIMEOUT_S = 180.0  # of one process, compiling included: 40 s of CPU the first time, on a loaded machine
 CONTROL_END_TIMEOUT_S = 15.0
 LAST_WORDS_S = 1.0  # for what the control process said last to arrive
 POLL_S = 0.02
