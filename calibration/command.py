@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from calibration.result import CalibrationError, Result, load, read
+if TYPE_CHECKING:
+    from calibration.result import Result
 
 Show = Callable[[dict[str, Any], bool], None]
 Refuse = Callable[[str], NoReturn]
@@ -30,6 +31,8 @@ def register(app: typer.Typer, show: Show, refuse: Refuse) -> None:
         as_json: AsJson = False,
     ) -> None:
         """May this result be used today, with this device? Example: asc calibrate check cam.json --camera 1234"""
+        from calibration.result import CalibrationError, load, read
+
         try:
             result = read(file)
         except CalibrationError as error:

@@ -135,6 +135,13 @@ def test_starting_the_control_process_loads_nothing_heavy() -> None:
     assert not loaded & {"mcap", "rerun", "cv2", "mujoco", "typer", "tqdm", "pytest", "sim_hil", "logs"}
 
 
+def test_the_command_line_loads_numpy_only_in_the_commands_that_need_it() -> None:
+    """Each of them limits BLAS to one thread first, which is too late once numpy is there: replay would refuse."""
+    code = "import sys, asc_rt.cli; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert not set(done.stdout.split()) & {"numpy", "numba", "pinocchio", "scipy", "cv2", "rerun"}
+
+
 # --- 5. product and simulation ---------------------------------------------------------------------------------------
 
 
