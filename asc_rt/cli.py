@@ -156,7 +156,7 @@ def bench(
     cell: Annotated[str, typer.Option(help="cell whose robot and period are used")] = DEFAULT_CELL,
     as_json: AsJson = False,
 ) -> None:
-    """Measure one decision and the punctuality of the loop, beside the cell's period. Example: asc bench cycle"""
+    """Measure one decision and the punctuality of the loop, beside their goals. Example: asc bench cycle"""
     _limit_blas()
     from asc_rt.bench import run as run_bench
 
@@ -168,7 +168,7 @@ def bench(
     for line in result["missing"]:
         print(f"real-time set-up lacks {line}", file=sys.stderr)
     for row in result["rows"]:
-        print(f"{row['name']:24} {row['value']:10.1f} {row['unit']} {row['ratio']:8.2%} of the period")
+        print(f"{row['name']:24} {row['value']:10.1f} {row['unit']} {row['ratio']:8.2f} of {row['reference']:g}")
 
 
 @app.command()

@@ -201,6 +201,37 @@ def _pair(
 
 
 @njit(cache=True)
+def _distance(r0: Vector, r1: Vector, radius: float, people: People, h: int) -> float:
+    """d of one pair alone, to the bit as `_pair` has it, m."""
+    h0, h1 = people.p0[h], people.p1[h]
+    s, t = _nearest(r0, r1, h0, h1)
+    squared = 0.0
+    for k in range(3):
+        w = r0[k] + s * (r1[k] - r0[k]) - h0[k] - t * (h1[k] - h0[k])
+        squared += w * w
+    d: float = max(np.sqrt(squared), MIN_AXIS_DISTANCE) - radius - people.radius[h]
+    return d
+
+
+@njit(cache=True)
+def least_distance(chain: Chain, capsules: Capsules, people: People, q: Vector) -> float:
+    """Smallest d of all pairs of a moving robot capsule and a human capsule, m; inf without a pair, nan if one is."""
+    motion = forward(chain, q, np.zeros(q.shape[0]))
+    least, r0, r1 = np.inf, np.empty(3), np.empty(3)
+    for i in range(capsules.joint.shape[0]):
+        if capsules.joint[i] < 0:
+            continue
+        _place(motion, capsules.joint[i], capsules.p0[i], r0)
+        _place(motion, capsules.joint[i], capsules.p1[i], r1)
+        for h in range(people.p0.shape[0]):
+            d = _distance(r0, r1, capsules.radius[i], people, h)
+            if np.isnan(d):
+                return np.nan
+            least = min(least, d)
+    return least
+
+
+@njit(cache=True)
 def separation(
     chain: Chain,
     capsules: Capsules,
@@ -226,6 +257,8 @@ def separation(
         _place(motion, joint, capsules.p0[i], r0)
         _place(motion, joint, capsules.p1[i], r1)
         for h in range(h_count):
+            if _distance(r0, r1, capsules.radius[i], people, h) >= reach:
+                continue  # not so for a distance that is not a number: that one is near
             d, d_dot, drift, d_dot_robot, drift_robot = _pair(
                 motion,
                 joint,
@@ -237,11 +270,10 @@ def separation(
                 human_acceleration,
                 C[count],
             )
-            if not d >= reach:  # a distance that is not a number is near
-                robot[count], human[count] = i, h
-                values[0, count], values[1, count], values[2, count] = d, d_dot, drift
-                values[3, count], values[4, count] = d_dot_robot, drift_robot
-                count += 1
+            robot[count], human[count] = i, h
+            values[0, count], values[1, count], values[2, count] = d, d_dot, drift
+            values[3, count], values[4, count] = d_dot_robot, drift_robot
+            count += 1
     return Separation(
         robot[:count],
         human[:count],

@@ -45,8 +45,13 @@ class Support(NamedTuple):
 
 @njit(cache=True)
 def greatest(c: Vector, U: Polytope) -> float:
-    """max c . u over U; -inf if U is empty."""
-    return support(c, U).value
+    """max c . u over U; -inf if U is empty. Without rows the joints are on their own."""
+    if U.G.shape[0] > 0 or np.any(U.lower > U.upper):
+        return support(c, U).value
+    value = 0.0
+    for i in range(c.shape[0]):
+        value += c[i] * (U.upper[i] if c[i] > 0.0 else U.lower[i])
+    return value
 
 
 @njit(cache=True)
@@ -61,6 +66,8 @@ def _worst_row(u: Vector, U: Polytope) -> tuple[int, bool]:
             reached, below, above = 0.0, U.low[r - n], U.high[r - n]
             for k in range(n):
                 reached += U.G[r - n, k] * u[k]
+        if below <= reached <= above:
+            continue
         scale = 1.0 / (1.0 + abs(below) + abs(above))
         if (reached - above) * scale > worst:
             worst, entering, to_upper = (reached - above) * scale, r, True

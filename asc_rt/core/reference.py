@@ -25,7 +25,7 @@ def reference(system: System, state: CoreState) -> Vector:
     request.current_velocity = state.dq_cmd.tolist()
     request.current_acceleration = state.ddq_cmd.tolist()
     request.target_position = state.goal.q.tolist()
-    request.max_velocity = [system.params.task.speed * v for v in r.dq_max]
+    request.max_velocity = [min(SHARE, system.params.task.speed) * v for v in r.dq_max]
     request.max_acceleration = [SHARE * a for a in r.ddq_max]
     request.max_jerk = [SHARE * j for j in r.dddq_max]
     plan = ruckig.Trajectory(system.n)

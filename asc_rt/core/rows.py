@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from asc_rt.core.abstraction import Separation, radii, separation
+from asc_rt.core.abstraction import Separation, least_distance, radii, separation
 from asc_rt.core.limits import command_box
 from asc_rt.core.people import predict
 from asc_rt.core.polytope import Polytope
@@ -94,9 +94,7 @@ def nearest_measured(system: System, x: CycleInputs) -> float:
     if x.joint is None or x.human is None:
         return float("inf")
     people = predict(x.human, x.human_age_ns * 1e-9)
-    model = (system.model.chain, system.model.capsules, people)
-    found = separation(*model, x.joint.q, x.joint.dq, float("inf"), 0.0)
-    return float(found.d.min()) if len(found.d) else float("inf")
+    return float(least_distance(system.model.chain, system.model.capsules, people, x.joint.q))
 
 
 def decision(

@@ -123,9 +123,10 @@ def test_bench_step_has_its_rows(asc: Any, monkeypatch: pytest.MonkeyPatch) -> N
     code, out, _ = asc("bench", "step", "--json")
     told = json.loads(out)
     assert code == 0 and told["machine"]
-    wanted = [f"pairs_{n}_{kind}" for n in (1, 10, 50) for kind in ("median", "p99")]
-    assert [row["name"] for row in told["rows"]] == wanted
-    assert all(row["unit"] == "us" and row["value"] > 0 and row["ratio"] > 0 for row in told["rows"])
+    parts = [(part, n, kind) for part in ("pairs", "rows_qp") for n in (1, 10, 50) for kind in ("median", "p99")]
+    assert [row["name"] for row in told["rows"]] == ["_".join(map(str, p)) for p in parts] + ["start", "start_memory"]
+    assert all(row["unit"] == "us" for row in told["rows"][:12])
+    assert all(row["value"] > 0 and row["ratio"] > 0 for row in told["rows"])
 
 
 def test_the_control_process_refuses_a_bad_cell_in_one_line() -> None:

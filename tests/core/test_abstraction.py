@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from asc_rt.core.abstraction import People, Separation, radii, separation
+from asc_rt.core.abstraction import People, Separation, least_distance, radii, separation
 from asc_rt.core.kinematics import Chain
 from asc_rt.core.limits import acceleration_box
-from asc_rt.core.polytope import Polytope, greatest
+from asc_rt.core.polytope import Polytope, greatest, support
 from asc_rt.core.robot_model import Capsules
 
 H = 2e-4  # s, of the oracle's differences
@@ -307,3 +307,23 @@ def test_inputs_are_left_alone(bench: Any) -> None:
     radii(system.model.arm, people, q, dq, ddq, 3.0, found)
     for before, after in zip(copies, (q, dq, *people), strict=True):
         np.testing.assert_array_equal(before, after)
+
+
+def test_the_least_distance_is_the_least_of_all_pairs(bench: Any) -> None:
+    system = bench.system()
+    for q, dq, _, people in motions(20, seed=12):
+        args = (system.model.chain, system.model.capsules, people, q)
+        assert least_distance(*args) == separation(*args, dq, np.inf, 0.0).d.min()  # to the bit
+    nowhere = people._replace(p0=np.full_like(people.p0, np.nan))
+    assert np.isnan(least_distance(*args[:2], nowhere, q))
+    none = np.zeros((0, 3))
+    assert least_distance(*args[:2], People(none, none, none, none, np.zeros(0), np.zeros(0)), q) == np.inf
+
+
+def test_the_closed_form_without_rows_is_the_program(bench: Any) -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        lower, width, c = rng.normal(size=6), rng.uniform(0.0, 3.0, 6), rng.normal(size=6)
+        U = Polytope(lower, lower + width, np.zeros((0, 6)), np.zeros(0), np.zeros(0))
+        assert greatest(c, U) == support(c, U).value  # to the bit
+    assert greatest(c, U._replace(upper=lower - 1.0)) == -np.inf
