@@ -19,7 +19,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="one JSON object as the las
 def register(app: typer.Typer, show: Show, refuse: Refuse) -> None:
     """Add `calibrate` with its commands; `show` prints a result, `refuse` ends the program for bad input."""
     group = typer.Typer(
-        help="Calibration results: made, and accepted or refused with the reason.", no_args_is_help=True
+        help="Calibration results: accepted or refused with the reason. Example: asc calibrate check cam.json",
+        no_args_is_help=True,
     )
     app.add_typer(group, name="calibrate")
 
