@@ -1,11 +1,17 @@
 """`asc bench`: what one decision costs, and how punctually a loop of this process wakes up.
 
-`step`: torque control, Panda, for 1, 10 and 50 active pairs among 20 human capsules, one after the other, caches warm:
-    pairs_N     the whole `step`, from frozen inputs to command and record
-    rows_qp_N   of it the safety rows (abstraction, M, M_dot, index) and the QP
+`step`: torque control, Panda, for 1, 10 and 50 active pairs, one state after the other, caches warm:
+    pairs_N   reference, safety rows, QP and torque; the nearest person is too near and what is wanted goes for them as
+              hard as the arm can, so the QP is solved every time. OSCBF's figures below are of the same: nominal
+              controller and filter
+    free_N    the same with the reference of the goal, which keeps every row: no QP
+    whole_N   the whole `step`, from frozen inputs to command and record, mode and checks of the person's data included
   and what a fresh process takes until it could touch the robot, kernels loaded from their cache.
 `cycle`: the step of the cell inside a loop of its period at real-time priority, where everything has gone cold since
 the last cycle: the figure that counts.
+`sampling`: states for which `asc certify` computes M and its rate in a second; more is better.
+`perception`: see `asc_rt.perception.bench`.
+`log`: see `logs.bench`.
 """
 
 from __future__ import annotations
@@ -24,6 +30,8 @@ import numpy as np
 
 from asc_rt import realtime
 from asc_rt.config import load_arm, load_cell
+from asc_rt.core import robot_model
+from asc_rt.core.fusion import heard
 from asc_rt.core.levels import LEVELS
 from asc_rt.core.params import Params
 from asc_rt.core.rows import rows
@@ -42,19 +50,23 @@ from asc_rt.core.types import (
     Matrix,
     OperatorEvent,
     RobotFlag,
+    Vector,
     vector,
 )
 from asc_rt.core.warm import warm_up
 
 PAIRS = (1, 10, 50)
 REPETITIONS = 2000
+SAMPLES, SAMPLES_PER_S = 100_000, 50_000.0  # of M and its rate; the goal: 100 000 in 2 s on 2 cores
 CYCLES = 750  # 6 s of 8 ms
 WARM_CYCLES = 50
 # Goals on the project's 2-core machine; OSCBF on frax/JAX there: 65, 70, 99 us, 4 s import, 4 s compile, 690 MB.
 STEP_MEDIAN_US, STEP_P99_US = {1: 50.0, 10: 65.0, 50: 95.0}, 150.0
 START_S, START_MB = 2.0, 200.0
 FAR, NEAR = 1.5, 0.9  # m from the robot's axis, where the capsules of the bench stand
+INSIDE = 0.01  # m under d_min
 SWING = 0.1  # rad, so little that the pairs stay the same
+LEAST_GAP = 0.002  # m; the moving arm must not bring one more pair into play
 
 Row = dict[str, Any]
 
@@ -69,14 +81,14 @@ def machine() -> str:
 
 
 def bench_step(params: Params) -> list[Row]:
-    """Median and p99 in us, for each of PAIRS, of one step and of its rows with the QP."""
-    whole, part = [], []
-    for pairs in PAIRS:
-        scene = Scene(params, pairs)
-        goal = {"median": STEP_MEDIAN_US[pairs], "p99": STEP_P99_US}
-        whole += _rows(f"pairs_{pairs}", np.array([timed(scene) for _ in range(REPETITIONS)]), goal)
-        part += _rows(f"rows_qp_{pairs}", np.array([_timed_rows(scene) for _ in range(REPETITIONS)]), goal)
-    return whole + part
+    """Median and p99 in us, for each of PAIRS, of the filter with and without the QP, and of one step."""
+    made = []
+    for name, one in (("pairs", _timed_conflict), ("free", _timed_free), ("whole", timed)):
+        for pairs in PAIRS:
+            scene = Scene(params, pairs, in_conflict=name == "pairs")
+            goal = {"median": STEP_MEDIAN_US[pairs], "p99": STEP_P99_US}
+            made += _rows(f"{name}_{pairs}", np.array([one(scene) for _ in range(REPETITIONS)]), goal)
+    return made
 
 
 def bench_start(cell_name: str) -> list[Row]:
@@ -91,13 +103,33 @@ def bench_start(cell_name: str) -> list[Row]:
     for _ in range(2):  # the first run may have to compile
         told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1]).stdout
     seconds, megabytes = (float(word) for word in told.split()[-2:])
-    return [_row("start", seconds, "s", START_S), _row("start_memory", megabytes, "MB", START_MB)]
+    return [row("start", seconds, "s", START_S), row("start_memory", megabytes, "MB", START_MB)]
 
 
 def reference_arm(params: Params) -> Params:
     """`params` for a torque-controlled Panda, the arm that the references below were measured with."""
     robot, tool = load_arm("panda", "ee1")
     return dataclasses.replace(params, robot=robot, tool=tool, control="torque", period_ns=1_000_000)
+
+
+def bench_sampling(params: Params) -> list[Row]:
+    """What `asc certify` draws in a second: M and its rate for states within torque and joint limits."""
+    from asc_rt.synthesis import sampling
+    from asc_rt.synthesis.certify import request_of
+
+    safety = params.safety
+    ranges = sampling.Ranges(
+        safety.d_min, safety.activation_distance, 1.0, 1.0, 1.6, safety.human_acceleration, True, "tool"
+    )
+    request = request_of(params, ranges, samples=SAMPLES)
+    model = robot_model.load(request.robot, request.tool, request.control)
+    draw = sampling.draw_of(model, len(request.tool.capsules), ranges)
+    for count in (SAMPLES // 100, SAMPLES):  # the first one loads the kernels
+        survey = sampling.Survey(model.arm, draw, request.seed, count, request.M_floor, ranges.v_max)
+        began = time.perf_counter()
+        sampling.collect(survey)
+        seconds = time.perf_counter() - began
+    return [row("samples", SAMPLES / seconds, "1/s", SAMPLES_PER_S)]
 
 
 def bench_cycle(params: Params, priority: int, cpu: int | None) -> tuple[list[Row], list[str]]:
@@ -127,6 +159,17 @@ def run(what: str, cell_name: str) -> dict[str, Any]:
     if what in ("cycle", "all"):
         cycle_rows, missing = bench_cycle(cell.params, cell.realtime.priority, cell.realtime.cpu)
         made += cycle_rows
+    if what in ("sampling", "all"):
+        made += bench_sampling(reference_arm(cell.params))
+    if what in ("perception", "all"):
+        from asc_rt.perception.bench import GOAL_MS
+        from asc_rt.perception.bench import bench as bench_perception
+
+        made += [row(name, ms, "ms", GOAL_MS) for name, ms in bench_perception(cell.params)]
+    if what in ("log", "all"):
+        from logs.bench import bench_log
+
+        made += bench_log(cell_name, cell)
     return {"machine": machine(), "missing": missing, "rows": made}
 
 
@@ -136,9 +179,20 @@ def run(what: str, cell_name: str) -> dict[str, Any]:
 class Scene:
     """A robot that turns its last joint to and fro among people, with `pairs` active pairs."""
 
-    def __init__(self, params: Params, pairs: int) -> None:
-        self.human = _crowd(MAX_CAPSULES)
-        self.system = System(_with_pairs(params, pairs, self.human))
+    def __init__(self, params: Params, pairs: int, in_conflict: bool = False) -> None:
+        """`in_conflict`: the nearest of them is nearer than d_min."""
+        moving = sum(int(joint) >= 0 for joint in System(params).model.capsules.joint)
+        people = min(MAX_CAPSULES, -(-(pairs + 1) // moving))  # no more than it takes
+        while _gap(params, pairs, _crowd(people)) < LEAST_GAP and people < MAX_CAPSULES:
+            people += 1
+        self.human = _crowd(people)
+        scene = _with_pairs(params, pairs, self.human)
+        if in_conflict:
+            d_min = _reach(params, 1, self.human) + INSIDE
+            scene = dataclasses.replace(
+                scene, safety=dataclasses.replace(scene.safety, d_min=d_min, rearm_distance=0.0)
+            )
+        self.system = System(scene)
         warm_up(self.system)
         self._moves = self._run()
 
@@ -167,14 +221,27 @@ def timed(scene: Scene) -> int:
     return time.perf_counter_ns() - began_ns
 
 
-def _timed_rows(scene: Scene) -> int:
-    """ns of the rows and the QP of one step."""
-    state, x = scene.next()
-    system = scene.system
-    u_ref = LEVELS[system.params.control].reference(system, state)
+def _timed_free(scene: Scene) -> int:
+    """ns of reference, rows and torque of one step; the reference keeps every row."""
+    return _timed_filter(scene, None)
+
+
+def _timed_conflict(scene: Scene) -> int:
+    """ns of the same with the QP, which is asked for the hardest approach to the nearest person."""
+    towards = -np.sign(rows(scene.system, *scene.next()).C[0])
+    return _timed_filter(scene, vector(towards * scene.system.bounds.ddq_max))
+
+
+def _timed_filter(scene: Scene, wanted: Vector | None) -> int:
+    (state, x), system = scene.next(), scene.system
+    level = LEVELS[system.params.control]
     began_ns = time.perf_counter_ns()
+    u_ref = level.reference(system, state)
     found = rows(system, state, x)
-    solve(u_ref, found.C, found.floor, found.base, found.U, system.bounds.ddq_max)
+    solution = solve(
+        u_ref if wanted is None else wanted, found.C, found.floor, found.base, found.box, system.bounds.ddq_max
+    )
+    level.set_point(system, state, solution.u)
     return time.perf_counter_ns() - began_ns
 
 
@@ -184,8 +251,9 @@ def _inputs(
     q = state.q_cmd if tick else vector(_middle(params))
     zero = vector(np.zeros(params.n))
     joint = JointState(tick, tick, tick, q, state.dq_cmd, zero, RobotFlag.READY | RobotFlag.SERVO_ON, 0, True)
-    human = dataclasses.replace(human, seq=tick + 1, calibration_hash=params.human.calibration_hash)
-    return CycleInputs(tick, tick, params.period_ns, joint, human, 0, False, goal, events, 0, False)
+    sensor = params.human.sensors[0]
+    human = dataclasses.replace(human, seq=tick + 1, calibration_hash=sensor.calibration_hash, sensor_id=sensor.id)
+    return CycleInputs(tick, tick, params.period_ns, joint, human, 0, heard(human, 0), goal, events, 0, False)
 
 
 def _middle(params: Params) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -194,13 +262,13 @@ def _middle(params: Params) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _crowd(count: int) -> HumanState:
     """Upright capsules in a half circle, each at a distance of its own, so that every number of pairs can be had."""
-    angle = np.linspace(-1.5, 1.5, count)
-    radius = np.linspace(NEAR, FAR, count)
+    angle = np.linspace(-1.5, 1.5, MAX_CAPSULES)[:count]
+    radius = np.linspace(NEAR, FAR, MAX_CAPSULES)[:count]
     foot: Matrix = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)])
     zeros = vector(np.zeros((count, 3)))
     return HumanState(
         t_capture_ns=0,
-        seq=0,
+        seq=1,  # 0 would mean that nothing has come yet
         sensor_id=0,
         calibration_hash=0,
         health=Health.OK,
@@ -219,8 +287,12 @@ def _crowd(count: int) -> HumanState:
 
 def _with_pairs(params: Params, pairs: int, human: HumanState) -> Params:
     """`params` with an activation distance well between that of the last wanted pair and that of the next one."""
-    edges = _reach(params, pairs, human), _reach(params, pairs + 1, human)
-    return _activated(params, 0.5 * sum(edges))
+    return _activated(params, _reach(params, pairs, human) + 0.5 * _gap(params, pairs, human))
+
+
+def _gap(params: Params, pairs: int, human: HumanState) -> float:
+    """Between the activation distances of the last wanted pair and of the next one, m."""
+    return _reach(params, pairs + 1, human) - _reach(params, pairs, human)
 
 
 def _reach(params: Params, pairs: int, human: HumanState) -> float:
@@ -245,9 +317,9 @@ def _count(params: Params, human: HumanState) -> int:
 
 def _rows(name: str, times_ns: np.ndarray[Any, np.dtype[np.int64]], reference_us: dict[str, float]) -> list[Row]:
     found = {"median": np.median(times_ns) * 1e-3, "p99": np.percentile(times_ns, 99) * 1e-3}
-    return [_row(f"{name}_{kind}", float(value), "us", reference_us[kind]) for kind, value in found.items()]
+    return [row(f"{name}_{kind}", float(value), "us", reference_us[kind]) for kind, value in found.items()]
 
 
-def _row(name: str, value: float, unit: str, reference: float) -> Row:
+def row(name: str, value: float, unit: str, reference: float) -> Row:
     ratio = round(value / reference, 5)
     return {"name": name, "value": round(value, 2), "unit": unit, "reference": reference, "ratio": ratio}

@@ -6,21 +6,19 @@ import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from asc_rt import topics
+from asc_rt import cell_cameras, topics
+from asc_rt.cell_cameras import PerceptionOptions
 from asc_rt.cell_files import CellFile, ProfileFile, ToolFile
+from asc_rt.core.params import SensorParams
 from asc_rt.explain import suggestion
+from asc_rt.faults import Faults
 from calibration.result import CalibrationError, load
 from drivers import registry
 
+LOOPBACK = ("127.0.0.1", "localhost")
 GROUND_TRUTH = "ground-truth"
 LEAST_RANGE_DEG = 20  # of a joint; 2 pi and less look like radians
 URDF_TOLERANCE_DEG = 0.1
-
-
-class Faults(list[str]):
-    def note(self, path: Path, key: str, text: str) -> None:
-        """One line: file, key, what is wrong; what would be right."""
-        self.append(f"{path}: {key}: {text}")
 
 
 def check_urdf(path: Path, profile: ProfileFile, urdf: Path, text: str, faults: Faults) -> None:
@@ -82,6 +80,21 @@ def check_tool(path: Path, tool: ToolFile, profile: ProfileFile, faults: Faults)
         )
 
 
+def check_tools(path: Path, cell: CellFile, profile: ProfileFile, faults: Faults) -> None:
+    assert cell.tools is not None
+    numbers, tools = [m.number for m in cell.tools.mount], [m.tool for m in cell.tools.mount]
+    for key, values in (("number", [str(number) for number in numbers]), ("tool", tools)):
+        if twice := sorted({value for value in values if values.count(value) > 1}):
+            faults.note(path, f"tools.mount.{key}", f"{', '.join(twice)} stands there twice; each once")
+    if cell.tool not in tools:
+        faults.note(
+            path, "tools.mount", f"the cell's own tool, {cell.tool}, is missing; mounted are {', '.join(tools)}"
+        )
+    if (count := len(cell.tools.nm_per_ampere)) not in (0, len(profile.joints.names)):
+        right = f"one each for {', '.join(profile.joints.names)}, or none"
+        faults.note(path, "tools.nm_per_ampere", f"{count} values for {len(profile.joints.names)} joints; {right}")
+
+
 def _is_solid(inertia: tuple[float, float, float, float, float, float]) -> bool:
     """Positive definite by its leading minors, and the triangle inequality of the diagonal."""
     xx, xy, xz, yy, yz, zz = inertia
@@ -107,15 +120,34 @@ def check_cell(path: Path, cell: CellFile, profile: ProfileFile, faults: Faults)
         faults.note(path, "safety.activation_m", f"{safety.activation_m:g} m is too small; above {least}")
     if safety.rearm_distance_m < safety.d_min_m:
         faults.note(path, "safety.rearm_distance_m", f"{safety.rearm_distance_m:g} m is too small; at least {least}")
-    if cell.sim and not cell.simulated:
-        faults.note(path, "sim", "this cell is real; [sim.*] tables belong to a cell with simulated = true")
+    _check_bus(path, cell, faults)
+    _check_ladder(path, cell, faults)
     if cell.uncertified and not cell.simulated:
         faults.note(path, "uncertified", "this cell is real; only a simulated one may run without a certificate")
-    for device in cell.sim.keys() - topics.SIM_DEVICES.keys():
+    for device in sorted(cell.sim.keys() - set(topics.SIM_DEVICES)):
         known = list(topics.SIM_DEVICES)
         near = suggestion(device, known)
         faults.note(path, f"sim.{device}", f"unknown device;{near} known: {', '.join(known)}")
     _check_driver(path, cell, faults)
+
+
+def _check_bus(path: Path, cell: CellFile, faults: Faults) -> None:
+    """Plain TCP stays on this machine."""
+    host = cell.bus.endpoint.removeprefix("tcp/").rpartition(":")[0]
+    if host not in LOOPBACK:
+        wrong = f"{host} is not this machine alone; one of {', '.join(LOOPBACK)}, and [bus.remote] for other machines"
+        faults.note(path, "bus.endpoint", wrong)
+
+
+def _check_ladder(path: Path, cell: CellFile, faults: Faults) -> None:
+    """Slow before stop."""
+    h = cell.human
+    if h.slow_age_ms > h.age_limit_ms:
+        wrong = f"{h.slow_age_ms:g} ms is too large; at most human.age_limit_ms = {h.age_limit_ms:g} ms"
+        faults.note(path, "human.slow_age_ms", wrong)
+    if h.slow_coverage < h.least_coverage:
+        wrong = f"{h.slow_coverage:g} is too small; at least human.least_coverage = {h.least_coverage:g}"
+        faults.note(path, "human.slow_coverage", wrong)
 
 
 def _check_driver(path: Path, cell: CellFile, faults: Faults) -> None:
@@ -131,19 +163,43 @@ def _check_driver(path: Path, cell: CellFile, faults: Faults) -> None:
         faults.note(path, "driver", str(error))
 
 
-def calibration_hash(path: Path, cell: CellFile, faults: Faults) -> int:
-    """The number that human messages must carry; 0: ground truth, which exists in simulation only."""
-    if cell.human.calibration == GROUND_TRUTH:
+def sensors(path: Path, cell: CellFile, cameras: PerceptionOptions | None, faults: Faults) -> tuple[SensorParams, ...]:
+    """The sensors of people that the cell names, each with the number that its messages must carry."""
+    names = cell.human.sensors
+    if len(set(names)) < len(names):
+        faults.note(path, "human.sensors", f"{', '.join(names)}: a name stands twice; each once")
+    for name in cell.human.calibrations.keys() - set(names):
+        near = suggestion(name, names)
+        faults.note(path, f"human.calibrations.{name}", f"no such sensor;{near} human.sensors: {', '.join(names)}")
+    return tuple(
+        SensorParams(name, i, _calibration_hash(path, cell, name, cameras, faults))
+        for i, name in enumerate(names, start=1)
+    )
+
+
+def _calibration_hash(
+    path: Path, cell: CellFile, sensor: str, cameras: PerceptionOptions | None, faults: Faults
+) -> int:
+    """The number that the sensor's messages must carry; 0: ground truth, which exists in simulation only."""
+    if cameras is not None and sensor == cameras.sensor:
+        return hash_number(cameras.digest)
+    own = cell.human.calibrations.get(sensor)
+    key = "human.calibration" if own is None else f"human.calibrations.{sensor}"
+    named = cell.human.calibration if own is None else own
+    if named == GROUND_TRUTH:
         if not cell.simulated:
-            wrong = f"{GROUND_TRUTH!r} exists in simulation only"
-            faults.note(path, "human.calibration", f"{wrong}; the sensor's calibration file")
+            faults.note(path, key, f"{GROUND_TRUTH!r} exists in simulation only; the sensor's calibration file")
         return 0
-    return _result_number(path, cell, faults)
+    if named == cell_cameras.CAMERAS:
+        if cell.perception is None or cell.perception.sensor != sensor:
+            faults.note(path, key, f"{named!r} are those of [perception], which this sensor is not; its own file")
+        return 0
+    return _result_number(path, cell, key, named, faults)
 
 
-def _result_number(path: Path, cell: CellFile, faults: Faults) -> int:
+def _result_number(path: Path, cell: CellFile, key: str, named: str, faults: Faults) -> int:
     """The hash of the camera's result file, if it is accepted, valid today and made for the camera of this cell."""
-    human, file = cell.human, path.parent / cell.human.calibration
+    human, file = cell.human, path.parent / named
     if not cell.simulated and not (human.camera and human.camera_mode):
         faults.note(path, "human.camera", "a real cell names serial and camera_mode of the camera it is calibrated for")
         return 0
@@ -152,7 +208,7 @@ def _result_number(path: Path, cell: CellFile, faults: Faults) -> int:
         result = load(file, "hand-eye", serials, human.camera_mode or None)
     except CalibrationError as error:
         for line in error.lines:
-            faults.note(path, "human.calibration", line)
+            faults.note(path, key, line)
         return 0
     return hash_number(result.digest)
 

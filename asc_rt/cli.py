@@ -42,12 +42,17 @@ AsJson = Annotated[bool, typer.Option("--json", help="one JSON object as the las
 
 class Device(StrEnum):
     FANUC = "fanuc"
+    CAN = "can"
     HUMAN = "human"
+    CAMERA = "camera"
 
 
 class Benchmark(StrEnum):
     STEP = "step"
     CYCLE = "cycle"
+    SAMPLING = "sampling"
+    PERCEPTION = "perception"
+    LOG = "log"
     ALL = "all"
 
 
@@ -81,6 +86,9 @@ def run(
     result = summarise(path)
     result["exit_reason"] = session.exit_reason(result["exit_reason"])
     result["processes_lost"] = session.deaths
+    result["cpu_share"] = session.cpu_share
+    if "driver" in session.end:
+        result["driver"] = session.end["driver"]
     _show(result, as_json)
     raise typer.Exit(0 if session.completed and not result["robot_caused_violations"] else 1)
 
@@ -92,7 +100,7 @@ def sim(
     port: Annotated[int | None, typer.Option(help="UDP port of the robot; default: the cell's driver.port")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="fanuc: exit 1 if the client broke the protocol")] = False,
     faults: Annotated[
-        Path | None, typer.Option(help="fanuc: script of faults, TOML with [[faults]]", metavar="FILE")
+        Path | None, typer.Option(help="fanuc, can: script of faults, TOML with [[faults]]", metavar="FILE")
     ] = None,
     overrides: Overrides = None,
 ) -> None:
@@ -104,6 +112,59 @@ def sim(
     config = load_cell(cell, changes)
     options = [*(["--strict"] if strict else []), *(["--faults", str(faults)] if faults else [])]
     raise typer.Exit(run_device(config, device.value, options))
+
+
+@app.command()
+def perceive(
+    cell: CellName = DEFAULT_CELL,
+    remote: Annotated[
+        bool, typer.Option("--remote", help="the cell runs on another machine: its [bus.remote]")
+    ] = False,
+    background: Annotated[
+        bool, typer.Option("--background", help="commission: learn what the cameras see in the empty cell")
+    ] = False,
+    arm: Annotated[
+        str, typer.Option("--arm-deg", metavar="Q1,Q2,...", help="where the arm stands meanwhile, as its pendant shows")
+    ] = "",
+    add: Annotated[
+        bool, typer.Option("--add", help="with the arm elsewhere, to learn what it hid the first time")
+    ] = False,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """The perception process alone. Example: asc perceive fanuc-sim-seeing"""
+    from asc_rt.config import load_cell
+    from asc_rt.processes import run_perception
+
+    config = load_cell(cell, overrides or [])
+    if config.perception is None:
+        _refuse(f"{config.path}: perception: missing; a cell that sees has a table [perception]")
+    if not background:
+        raise typer.Exit(run_perception(config, remote))
+    from asc_rt.perception.commission import CommissionError, commission
+
+    try:
+        result = commission(config, arm, add)
+    except CommissionError as error:
+        _refuse(str(error))
+    _show(result, as_json)
+    raise typer.Exit(0 if result["ok"] else 1)
+
+
+@app.command()
+def keys(cell: CellName = DEFAULT_CELL, overrides: Overrides = None, as_json: AsJson = False) -> None:
+    """Certificates for a cell of several machines: one for the cell, one for each sensor. Example: asc keys CELL"""
+    from asc_rt import bus_keys
+    from asc_rt.config import load_cell
+
+    config = load_cell(cell, overrides or [])
+    if config.remote is None:
+        _refuse(f"{config.path}: bus.remote: missing; its endpoint is where the cell listens for other machines")
+    try:
+        made = bus_keys.make(config.remote.keys, config.remote.host, [s.name for s in config.params.human.sensors])
+    except OSError as error:
+        _refuse(f"{config.remote.keys}: {error.strerror}: {error.filename}; remove the folder to make all keys anew")
+    _show({"made": [str(path) for path in made]}, as_json)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
@@ -151,12 +212,17 @@ def view(
 @app.command()
 def bench(
     what: Annotated[
-        Benchmark, typer.Argument(help="step: the decision alone; cycle: in a loop at the cell's period")
+        Benchmark,
+        typer.Argument(
+            help="step: the decision alone; cycle: in a loop at the cell's period; sampling: states that "
+            "certify draws in a second; perception: from a depth picture to people; log: what recording costs the "
+            "loop and the logger"
+        ),
     ] = Benchmark.ALL,
     cell: Annotated[str, typer.Option(help="cell whose robot and period are used")] = DEFAULT_CELL,
     as_json: AsJson = False,
 ) -> None:
-    """Measure one decision and the punctuality of the loop, beside their goals. Example: asc bench cycle"""
+    """Measure decision, loop, sampling and recording, beside their goals. Example: asc bench cycle"""
     _limit_blas()
     from asc_rt.bench import run as run_bench
 
@@ -169,6 +235,31 @@ def bench(
         print(f"real-time set-up lacks {line}", file=sys.stderr)
     for row in result["rows"]:
         print(f"{row['name']:24} {row['value']:10.1f} {row['unit']} {row['ratio']:8.2f} of {row['reference']:g}")
+
+
+@app.command()
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="recording of a cell on CAN")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="candump .log, .asc or .blf")],
+) -> None:
+    """Write the frames of a recording as a standard CAN log. Example: asc export runs/latest.mcap can.log"""
+    from drivers.base import DriverError, Exportable
+    from logs.recording import open_recording
+    from logs.wire import codec_of, driver_of, packets
+
+    if out.exists():
+        _refuse(f"{out} exists; it is not overwritten")
+    recording = open_recording(log)
+    driver = codec_of(recording)
+    if not isinstance(driver, Exportable):
+        _refuse(f"{log}: driver {driver_of(recording)!r} has no format for other tools")
+    rx, tx = packets(recording)
+    both = [("rx", t_ns, data) for t_ns, data in rx.items()] + [("tx", t_ns, data) for t_ns, data in tx.items()]
+    try:
+        count = driver.export(sorted(both, key=lambda packet: packet[1]), str(out))
+    except (ValueError, DriverError) as error:
+        _refuse(f"{log}: {error}")
+    print(f"{count} frames in {out}")
 
 
 @app.command()

@@ -1,12 +1,8 @@
-"""Load and check a cell: its own file, the robot's profile and URDF, the tool. Every error at once, one line each.
-
-Degrees, milliseconds and kilograms of the files become SI and radians here and nowhere else.
-"""
+"""Load and check a cell: its own file, the robot's profile and URDF, the tool. Every error at once, one line each."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import tomllib
 from collections.abc import Sequence
@@ -16,11 +12,22 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from asc_rt import cell_cameras
 from asc_rt import cell_checks as checks
-from asc_rt.cell_checks import Faults
-from asc_rt.cell_files import Capsule, CellFile, ProfileFile, Safety, Table, ToolFile
-from asc_rt.core.params import CapsuleSpec, HumanParams, Params, RobotParams, SafetyParams, TaskParams, ToolParams
+from asc_rt.cell_cameras import PerceptionOptions
+from asc_rt.cell_files import CellFile, ProfileFile, Safety, Table, ToolFile
+from asc_rt.cell_params import cell_params, radians, robot_params, safety_params, tool_params
+from asc_rt.core.params import (
+    STAND_IN,
+    ChangerParams,
+    Mount,
+    Params,
+    RobotParams,
+    ToolParams,
+)
+from asc_rt.enclosing import enclosing_sphere
 from asc_rt.explain import explain, suggestion
+from asc_rt.faults import Faults, FaultsError
 
 PACKAGE = Path(__file__).parent
 CELLS, ROBOTS, TOOLS = PACKAGE / "cells", PACKAGE / "robots", PACKAGE / "robots" / "tools"
@@ -28,18 +35,24 @@ CELLS, ROBOTS, TOOLS = PACKAGE / "cells", PACKAGE / "robots", PACKAGE / "robots"
 File = TypeVar("File", bound=Table)
 
 
-class ConfigError(Exception):
+class ConfigError(FaultsError):
     """`lines`: one per fault, as `FILE: KEY: what is wrong; what would be right`."""
-
-    def __init__(self, lines: Sequence[str]) -> None:
-        super().__init__("\n".join(lines))
-        self.lines = tuple(lines)
 
 
 @dataclass(frozen=True, slots=True)
 class RealTimeOptions:
     priority: int
     cpu: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteOptions:
+    endpoint: str  # "tls/HOST:PORT"
+    keys: Path  # folder
+
+    @property
+    def host(self) -> str:
+        return self.endpoint.removeprefix("tls/").rpartition(":")[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +69,14 @@ class Cell:
     text: str  # the cell file as it stands
     overrides: tuple[str, ...]  # "key=value" put over it
     params: Params
+    perception: PerceptionOptions | None  # None: its people are not seen by cameras of ours
     driver: dict[str, Any]  # the [driver] table, with `name`
     sim: dict[str, dict[str, Any]]  # the [sim.*] tables
     simulated: bool
     certificates: Path  # folder
     uncertified: bool  # runs whether or not a certificate covers it: in simulation, and recorded
     bus_endpoint: str
+    remote: RemoteOptions | None  # how sensors on other machines come in; None: not at all
     goals: tuple[tuple[float, ...], ...]  # rad
     log_dir: Path
     log: LogOptions
@@ -97,11 +112,15 @@ def load_cell(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Cell:
     checks.check_urdf(profile_path, profile, urdf_path, urdf, faults)
     checks.check_tool(_part_path("tool", cell.tool), tool, profile, faults)
     checks.check_cell(path, cell, profile, faults)
-    calibration = checks.calibration_hash(path, cell, faults)
+    cameras = cell_cameras.options(path, cell, faults)
+    sensors = checks.sensors(path, cell, cameras, faults)
     if faults:
         raise ConfigError(faults)
-    params = _params(cell, profile, tool, urdf, calibration)
-    return _assemble(path, text, overrides, cell, params)
+    params = cell_params(cell, profile, tool, urdf, sensors)
+    params = dataclasses.replace(params, changer=_changer(path, cell, profile, faults))
+    if faults:
+        raise ConfigError(faults)
+    return _assemble(path, text, overrides, cell, params, cameras)
 
 
 def load_arm(robot: str, tool: str) -> tuple[RobotParams, ToolParams]:
@@ -119,7 +138,7 @@ def load_arm(robot: str, tool: str) -> tuple[RobotParams, ToolParams]:
     checks.check_tool(_part_path("tool", tool), tool_file, profile, faults)
     if faults:
         raise ConfigError(faults)
-    return _robot(profile, urdf), _tool(tool_file, profile.flange)
+    return robot_params(profile, urdf), tool_params(tool_file, profile.flange)
 
 
 def what_if(params: Params, changes: Sequence[str]) -> Params:
@@ -134,6 +153,9 @@ def what_if(params: Params, changes: Sequence[str]) -> Params:
             "M_floor": s.M_floor,
             "human_acceleration_m_s2": s.human_acceleration,
             "rearm_distance_m": s.rearm_distance,
+            "index": s.index,
+            "brake_m_s2": s.brake,
+            "v_max_m_s": s.v_max,
         }
     }
     faults = _apply(tree, changes)
@@ -142,7 +164,7 @@ def what_if(params: Params, changes: Sequence[str]) -> Params:
     safety = _check(Safety, Path("--set safety"), tree["safety"], faults)
     if safety is None or faults:
         raise ConfigError(faults)
-    return dataclasses.replace(params, safety=_safety(safety))
+    return dataclasses.replace(params, safety=safety_params(safety))
 
 
 def find_cell(path_or_name: str | Path) -> Path:
@@ -250,20 +272,24 @@ def _part(kind: type[File], cell: Path, key: str, name: Any, faults: Faults) -> 
 # --- putting together ------------------------------------------------------------------------------------------------
 
 
-def _assemble(path: Path, text: str, overrides: Sequence[str], cell: CellFile, params: Params) -> Cell:
+def _assemble(
+    path: Path, text: str, overrides: Sequence[str], cell: CellFile, params: Params, cameras: PerceptionOptions | None
+) -> Cell:
     return Cell(
         name=cell.name,
         path=path.resolve(),
         text=text,
         overrides=tuple(overrides),
         params=params,
+        perception=cameras,
         driver=cell.driver.model_dump(),
         sim=cell.sim,
         simulated=cell.simulated,
         certificates=path.resolve().parent / cell.certificates,
         uncertified=cell.uncertified,
         bus_endpoint=cell.bus.endpoint,
-        goals=tuple(_radians(goal) for goal in cell.task.goals_deg),
+        remote=_remote(path, cell),
+        goals=tuple(radians(goal) for goal in cell.task.goals_deg),
         log_dir=Path(cell.log.dir),
         log=LogOptions(
             key=path.resolve().parent / cell.log.key if cell.log.key else None,
@@ -274,62 +300,30 @@ def _assemble(path: Path, text: str, overrides: Sequence[str], cell: CellFile, p
     )
 
 
-def _params(cell: CellFile, profile: ProfileFile, tool: ToolFile, urdf: str, calibration: int) -> Params:
-    return Params(
-        period_ns=cell.period_ms * 1_000_000,
-        control=cell.control.level,
-        silence_cycles=cell.control.silence_cycles,
-        tracking_tolerance=math.radians(cell.control.tracking_tolerance_deg),
-        robot=_robot(profile, urdf),
-        tool=_tool(tool, profile.flange),
-        safety=_safety(cell.safety),
-        human=HumanParams(_ns(cell.human.age_limit_ms), _ns(cell.human.future_limit_ms), calibration),
-        task=TaskParams(cell.task.speed, math.radians(cell.task.goal_tolerance_deg)),
+def _remote(path: Path, cell: CellFile) -> RemoteOptions | None:
+    remote = cell.bus.remote
+    return None if remote is None else RemoteOptions(remote.endpoint, path.resolve().parent / remote.keys)
+
+
+def _changer(path: Path, cell: CellFile, profile: ProfileFile, faults: Faults) -> ChangerParams:
+    """The tools of [tools], the cell's own first. No certificate is known here: none is covered yet."""
+    table = cell.tools
+    if table is None:
+        return ChangerParams()
+    checks.check_tools(path, cell, profile, faults)
+    mounts = []
+    for entry in sorted(table.mount, key=lambda entry: entry.tool != cell.tool):
+        file = _part(ToolFile, path, "tool", entry.tool, faults)
+        if file is not None:
+            checks.check_tool(_part_path("tool", entry.tool), file, profile, faults)
+            mounts.append(Mount(entry.number, tool_params(file, profile.flange), entry.speed_share, covered=False))
+    if table.unknown == "enclosing-sphere" and mounts:
+        sphere = enclosing_sphere([mount.tool for mount in mounts], profile.flange)
+        mounts.append(Mount(STAND_IN, sphere, min(mount.speed_share for mount in mounts), covered=False))
+    return ChangerParams(
+        mounts=tuple(mounts),
+        told_by_robot=table.told_by == "robot",
+        goes_on=table.in_motion == "go-on",
+        nm_per_ampere=tuple(table.nm_per_ampere),
+        torque_tolerance=table.torque_tolerance_nm,
     )
-
-
-def _safety(safety: Safety) -> SafetyParams:
-    return SafetyParams(
-        d_min=safety.d_min_m,
-        activation_distance=safety.activation_m,
-        k=safety.k,
-        eta=safety.eta,
-        M_floor=safety.M_floor,
-        human_acceleration=safety.human_acceleration_m_s2,
-        rearm_distance=safety.rearm_distance_m,
-    )
-
-
-def _robot(profile: ProfileFile, urdf: str) -> RobotParams:
-    joints = profile.joints
-    return RobotParams(
-        name=profile.name,
-        urdf=urdf,
-        joints=tuple(joints.names),
-        flange=profile.flange,
-        q_min=_radians([low for low, _ in joints.position_deg]),
-        q_max=_radians([high for _, high in joints.position_deg]),
-        dq_max=_radians(joints.velocity_deg_s),
-        ddq_max=_radians(joints.acceleration_deg_s2),
-        dddq_max=_radians(joints.jerk_deg_s3),
-        effort=tuple(joints.effort_nm or ()),
-        command_latency_ns=_ns(profile.command_latency_ms),
-        capsules=tuple(_capsule(c.link, c) for c in profile.capsules),
-    )
-
-
-def _tool(tool: ToolFile, flange: str) -> ToolParams:
-    capsules = tuple(_capsule(flange, capsule) for capsule in tool.capsules)
-    return ToolParams(tool.name, tool.mass_kg, tool.com, tool.inertia, capsules)
-
-
-def _capsule(link: str, capsule: Capsule) -> CapsuleSpec:
-    return CapsuleSpec(link, capsule.p0, capsule.p1, capsule.radius)
-
-
-def _radians(degrees: Sequence[float]) -> tuple[float, ...]:
-    return tuple(math.radians(angle) for angle in degrees)
-
-
-def _ns(milliseconds: float) -> int:
-    return round(milliseconds * 1e6)

@@ -25,15 +25,17 @@ class Operator:
         self, events: Publisher, goals: Publisher, poses: Sequence[Sequence[float]], arms_itself: bool
     ) -> None:
         self.goal_id = 0  # of the goal sent last
+        self.is_done = False  # True: the session may end
+        self.takes_away: list[str] = []  # processes that the supervisor is to end, as if their device were unplugged
         self._events, self._goals, self._poses = events, goals, poses
         self._arms_itself = arms_itself
         self._event_id = 0
         self._armable_since: float | None = None
         self._goal_sent = 0.0
 
-    def say(self, kind: EventKind) -> None:
+    def say(self, kind: EventKind, tool: int = 0) -> None:
         self._event_id += 1
-        self._events.put_json({"id": self._event_id, "kind": kind.name})
+        self._events.put_json({"id": self._event_id, "kind": kind.name, "tool": tool})
 
     def hear(self, state: dict[str, Any], now: float) -> None:
         """React to the control process's state at `now` (s)."""
@@ -47,6 +49,8 @@ class Operator:
             self.say(EventKind.ARM)
 
     def _goal(self, state: dict[str, Any], now: float) -> None:
+        if not self._poses:
+            return
         if self.goal_id == 0 or state.get("reached_id", 0) >= self.goal_id:
             self.goal_id += 1
         elif state.get("goal_id", 0) >= self.goal_id or now - self._goal_sent < RESEND_S:
@@ -64,8 +68,8 @@ class Keyboard:
     def __init__(self) -> None:
         self._open = not sys.stdin.closed
 
-    def read(self) -> EventKind | str | None:
-        """The command typed, a text that is none, or None. Never waits for a line to begin."""
+    def read(self) -> EventKind | int | str | None:
+        """The command typed, the number of a tool, a text that is neither, or None. Never waits for a line to begin."""
         if not self._open or not select.select([sys.stdin], [], [], 0)[0]:
             return None
         line = sys.stdin.readline()
@@ -73,4 +77,7 @@ class Keyboard:
             self._open = False
             return None
         word = line.strip().lower()
+        verb, _, number = word.partition(" ")
+        if verb == "tool" and number.strip().isdecimal():
+            return int(number)
         return self.WORDS.get(word, word)

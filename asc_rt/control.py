@@ -5,7 +5,7 @@ Exit code 0: the session ended as asked; 1: it ended for a fault; 2: it did not 
 
 from __future__ import annotations
 
-from asc_rt import realtime
+from asc_rt import launch, realtime
 
 if __name__ == "__main__":
     realtime.one_blas_thread()  # before anything below imports numpy
@@ -20,10 +20,12 @@ from typing import Any
 
 from asc_rt import pacing, topics
 from asc_rt.bus import Bus, BusError, open_client
-from asc_rt.certified import require
+from asc_rt.certified import covered, require
 from asc_rt.config import Cell, ConfigError, load_cell
+from asc_rt.core import torque
+from asc_rt.core.levels import LEVELS
 from asc_rt.core.system import System
-from asc_rt.core.types import CommandKind, CoreState, CycleInputs, CycleOutputs, Mode, StopReason
+from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs, Mode, StopReason, vector
 from asc_rt.core.warm import warm_up
 from asc_rt.cycle import run
 from asc_rt.inputs import Mail
@@ -31,7 +33,16 @@ from asc_rt.record import RecordError, RecordLayout, Timings
 from asc_rt.ring import RingError, RingWriter, wire_path, wire_tap
 from asc_rt.robot_limits import within
 from drivers import registry
-from drivers.base import DriverCaps, DriverError, HandshakeError, RobotDriver, RobotFaulted, WriteReceipt
+from drivers.base import (
+    DriverCaps,
+    DriverError,
+    HandshakeError,
+    Reporting,
+    RobotDriver,
+    RobotFaulted,
+    Weighted,
+    WriteReceipt,
+)
 
 COMPLETED, FAILED, NOT_BEGUN = 0, 1, 2
 
@@ -58,7 +69,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m asc_rt.control", description="The control process of a cell.")
     parser.add_argument("cell", help="cell file or name of a cell")
     parser.add_argument("--ring", required=True, help="ring of the session in shared memory, made by the supervisor")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="put over the cell file")
+    launch.add_overrides(parser)
     args = parser.parse_args(argv)
     try:
         cell = load_cell(args.cell, args.set)
@@ -87,19 +98,28 @@ def main(argv: list[str] | None = None) -> int:
 def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder: RingRecorder) -> int:
     """From opening the robot's link to releasing it; start, end and errors are told on the bus."""
     tell = bus.event_publisher(topics.CONTROL.key).put_json
-    mail = Mail(
-        bus.latest(topics.HUMAN.key), bus.queue(topics.OPERATOR.key), bus.latest(topics.GOAL.key), joints=system.n
-    )
+    people = {sensor.id: bus.latest(topics.human(sensor.name).key) for sensor in cell.params.human.sensors}
+    reach = system.bounds.q_min, system.bounds.q_max
+    mail = Mail(people, bus.queue(topics.OPERATOR.key), bus.latest(topics.GOAL.key), joints=system.n, reach=reach)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(mail, "end_requested", True))
+    end: dict[str, Any]
     code, end = NOT_BEGUN, {"mode": Mode.IDLE.name, "reason": StopReason.EXCEPTION.name}
     try:
         caps = driver.configure()
         _check(caps, system)
-        system = System(within(cell.params, caps.limits))  # the smaller of the profile's and the robot's own limits
+        # the smaller of the profile's and the robot's own limits; every tool that may come, before anything moves
+        params, uncovered = covered(cell, within(cell.params, caps.limits))
+        for reason in uncovered:
+            print(f"not to be moved with: {reason}", file=sys.stderr, flush=True)
+        system = System(params)
         _certified(cell, system)
         warm_up(system)
         report = realtime.set_up(cell.realtime.priority, cell.realtime.cpu)
+        if isinstance(driver, Weighted):
+            # Read-only, as in the core: other arrays would compile the kernels anew, in the middle of the stream.
+            driver.dynamics = lambda q, dq, ddq: torque.set_point(system, vector(q), vector(dq), vector(ddq)).tau
+            driver.dynamics(system.zero, system.zero, system.zero)  # called once: loaded before there is a stream
         driver.activate(cell.params.period_ns)
         decided_with = system.params.canonical().decode()
         tell(
@@ -129,6 +149,8 @@ def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder
         end |= {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
     finally:
         driver.close()
+    if isinstance(driver, Reporting):
+        end["driver"] = driver.report()
     tell({"event": "end", "code": code, "unrecorded": recorder.unrecorded, "refused": list(mail.faults), **end})
     return code
 
@@ -139,8 +161,19 @@ def _check(caps: DriverCaps, system: System) -> None:
             f"the robot ({caps.identity}) has {caps.dof} joints, the cell's robot {system.n}",
             hint="let the cell's `robot` be the one that is connected",
         )
-    if CommandKind.POSITION not in caps.kinds:
-        raise HandshakeError(f"the robot ({caps.identity}) takes no joint positions", hint="use another driver")
+    wanted = LEVELS[system.params.control].kind
+    if wanted not in caps.kinds:
+        told = " and ".join(sorted(kind.name.lower() for kind in caps.kinds))
+        raise HandshakeError(
+            f"the cell commands {wanted.name.lower()}, the robot ({caps.identity}) takes {told}",
+            hint="set control.level of the cell as the robot can, or use another driver",
+        )
+    if caps.tells_tool != system.params.changer.told_by_robot:
+        says = "tells the number of its tool" if caps.tells_tool else "tells no tool"
+        raise HandshakeError(
+            f"the robot {says}, the cell says otherwise",
+            hint='let [tools] told_by be "robot" if the driver hears the changer (driver.tool_input), else "operator"',
+        )
 
 
 def _certified(cell: Cell, system: System) -> None:

@@ -27,15 +27,23 @@ NOT_THERE = "robot"  # the driver's finding that nobody answers: a simulated rob
 
 def examine(cell_name: str) -> dict[str, Any]:
     """All checks; `ok` when all of them hold."""
-    findings = [check() for check in PC]
+    findings = examine_pc()
     try:
         cell = load_cell(cell_name)
     except ConfigError as error:
         findings += [Finding("cell", False, line, "correct the file") for line in error.lines]
     else:
-        findings += [finding for check in CELL for finding in check(cell)]
+        findings += examine_cell(cell)
     checks = [asdict(replace(found, fix="" if found.ok else found.fix)) for found in findings]
     return {"checks": checks, "ok": all(found.ok for found in findings)}
+
+
+def examine_pc() -> list[Finding]:
+    return [check() for check in PC]
+
+
+def examine_cell(cell: Cell) -> list[Finding]:
+    return [finding for check in CELL for finding in check(cell)]
 
 
 # --- this PC ---------------------------------------------------------------------------------------------------------
@@ -124,9 +132,10 @@ def _certificate(cell: Cell) -> Iterator[Finding]:
 
 def _calibration(cell: Cell) -> Iterator[Finding]:
     """A file that must not be used is refused with the cell; here is what was found good."""
-    number = cell.params.human.calibration_hash
-    detail = f"result file {number:016x} is accepted and valid" if number else "ground truth of the simulation"
-    yield Finding("calibration", True, detail)
+    for sensor in cell.params.human.sensors:
+        number = sensor.calibration_hash
+        detail = f"result file {number:016x} is accepted and valid" if number else "ground truth of the simulation"
+        yield Finding("calibration", True, f"{sensor.name}: {detail}")
 
 
 def _bus_port(cell: Cell) -> Iterator[Finding]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import operator
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -33,22 +34,26 @@ class Unsigned(int):
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """A column of numbers: as long as the message's count, else one row per joint; `width` numbers in each row."""
+    """A column of numbers: as long as the message's count, else one row per joint; `width` numbers in each row. In a
+    message of `rows` each number stands for a `kind`."""
 
     dtype: str = "<f8"
     width: int = 1
+    kind: type = float
 
 
 JOINTS = COLUMN = Array()
 POINTS = Array(width=3)
-INDICES = Array("<i8")
+INDICES = Array("<i8", kind=int)
+NUMBERS = Array("<u8", kind=int)
 
 
 class Message:
     """One dataclass as a protobuf message. Fields: name -> Python type, Array or Message; the order numbers them.
 
     `optional`: None is a value of its own (a flag `present`). `capacity`: the arrays hold 0..capacity rows (a field
-    `count`), else n. Scalars stand before arrays, arrays before messages, whatever order the table has.
+    `count`), else n. `rows`: a tuple of 0..capacity dataclasses, written as columns. Scalars stand before
+    arrays, arrays before messages, whatever order the table has.
     """
 
     def __init__(
@@ -58,10 +63,9 @@ class Message:
         *,
         optional: bool = False,
         capacity: int = 0,
-        encode: Callable[[Any], Any] | None = None,
-        decode: Callable[[Any], Any] | None = None,
+        rows: bool = False,
     ) -> None:
-        self.cls, self.optional, self.capacity, self.encode, self.decode = cls, optional, capacity, encode, decode
+        self.cls, self.optional, self.capacity, self.rows = cls, optional, capacity, rows
         self.messages = {k: v for k, v in fields.items() if isinstance(v, Message)}
         self.arrays = {k: v for k, v in fields.items() if isinstance(v, Array)}
         self.scalars = {k: v for k, v in fields.items() if k not in self.messages and k not in self.arrays}
@@ -104,7 +108,7 @@ def _wire(kind: type) -> tuple[str, str, int, int]:
     return "q", "<i8", FieldProto.TYPE_SFIXED64, FIXED64
 
 
-def _varint(value: int) -> bytes:
+def varint(value: int) -> bytes:
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -113,7 +117,7 @@ def _varint(value: int) -> bytes:
 
 
 def tag(number: int, wire_type: int) -> bytes:
-    return _varint(number << 3 | wire_type)
+    return varint(number << 3 | wire_type)
 
 
 def _leaves(message: Message, n: int, path: str) -> list[Leaf]:
@@ -128,7 +132,7 @@ def _leaves(message: Message, n: int, path: str) -> list[Leaf]:
         size = 8 * rows * array.width
         shape = (rows,) if array.width == 1 else (rows, array.width)
         kind = float if array.dtype == "<f8" else int
-        head = tag(next(numbers), LENGTH) + _varint(size)
+        head = tag(next(numbers), LENGTH) + varint(size)
         found.append(Leaf(f"{path}.{name}", head, f"{size}s", array.dtype, shape, kind))
     for name, inner in message.messages.items():
         found += _headed(next(numbers), _leaves(inner, n, f"{path}.{name}"))
@@ -139,7 +143,7 @@ def _headed(number: int, leaves: list[Leaf]) -> list[Leaf]:
     """The leaves of a message with its tag and length put before the first."""
     size = sum(len(leaf.tag) + leaf.size for leaf in leaves)
     first = leaves[0]
-    head = tag(number, LENGTH) + _varint(size) + first.tag
+    head = tag(number, LENGTH) + varint(size) + first.tag
     return [dataclasses.replace(first, tag=head), *leaves[1:]]
 
 
@@ -160,16 +164,15 @@ def _gather(message: Message, n: int, path: str, it: str, tags: Iterator[bytes],
     items += [f"{next(tags)!r}, {value}" for value in values]
     for name, inner in message.messages.items():
         inner_path, inner_it = f"{path}.{name}", f"{it}.{name}"
-        if inner.encode is None and not inner.optional:
+        if not (inner.rows or inner.optional):
             items.append(_gather(inner, n, inner_path, inner_it, tags, names).rstrip(", "))
             continue
         own = [next(tags) for _ in _absent(inner)]  # no value, and no rows, are the same bytes
         key = inner_path.replace(".", "_")
         names[f"absent_{key}"] = _with_tags(own, _absent(inner))
-        if inner.encode is not None:
-            names[f"encode_{key}"] = inner.encode
-            names[f"gather_{key}"] = _compile(inner, n, inner_path, own)
-            present = f"gather_{key}(encode_{key}({inner_it})) if {inner_it} else absent_{key}"
+        if inner.rows:
+            names[f"gather_{key}"] = _gather_rows(inner, inner_path, own)
+            present = f"gather_{key}({inner_it}) if {inner_it} else absent_{key}"
         else:
             there = _gather(inner, n, inner_path, inner_it, iter(own), names)
             present = f"absent_{key} if {inner_it} is None else ({there})"
@@ -177,11 +180,24 @@ def _gather(message: Message, n: int, path: str, it: str, tags: Iterator[bytes],
     return ", ".join(items) + ","
 
 
-def _compile(message: Message, n: int, path: str, tags: list[bytes]) -> Callable[[Any], tuple[Any, ...]]:
-    names: dict[str, Any] = {"_misfit": _misfit}
-    source = _gather(message, n, path, "it", iter(tags), names)
-    made: Callable[[Any], tuple[Any, ...]] = eval(f"lambda it: ({source})", names)
-    return made
+def _gather_rows(message: Message, path: str, tags: list[bytes]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+    """The tags and values of a tuple of dataclasses, which is not empty, as columns."""
+    fields, codes = operator.attrgetter(*message.arrays), [_CODE[array.dtype] for array in message.arrays.values()]
+    counts = range(message.capacity + 1)
+    pack = [struct.Struct("<" + "".join(f"{n}{code}" for code in codes)).pack for n in counts]
+    split = [struct.Struct(f"{8 * n}s" * len(codes)).unpack for n in counts]
+    columns = [f"column{i}" for i in range(len(codes))]
+    woven = ", ".join(f"{tag!r}, {name}" for tag, name in zip(tags, ["n", *columns], strict=True))
+    weave: Callable[..., tuple[Any, ...]] = eval(f"lambda n, {', '.join(columns)}: ({woven})")
+
+    def gather(rows: tuple[Any, ...]) -> tuple[Any, ...]:
+        n = len(rows)
+        if n > message.capacity:
+            _misfit(path, "up to", message.capacity)
+        values = fields(rows[0]) if n == 1 else itertools.chain.from_iterable(zip(*map(fields, rows), strict=True))
+        return weave(n, *split[n](pack[n](*values)))
+
+    return gather
 
 
 def _count(message: Message, path: str, it: str) -> str:
@@ -196,6 +212,9 @@ def _count(message: Message, path: str, it: str) -> str:
 
 def _misfit(path: str, what: str, number: int) -> NoReturn:
     raise RecordError(f"{path}: its arrays are not {what} {number} of 8-byte numbers")
+
+
+_CODE = {"<f8": "d", "<i8": "q", "<u8": "Q"}
 
 
 def _with_tags(tags: list[bytes], values: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -224,8 +243,13 @@ def _build(message: Message, path: str, n: int, row: Iterator[Any]) -> Any:
         made[name] = flat if array.width == 1 else flat.reshape(count, array.width)
     for name, inner in message.messages.items():
         made[name] = _build(inner, f"{path}.{name}", n, row)
-    obj = message.cls(**made)
-    return obj if message.decode is None else message.decode(obj)
+    if not message.rows:
+        return message.cls(**made)
+    columns = [
+        [_scalar(f"{path}.{name}", message.arrays[name].kind, value) for value in column.tolist()]
+        for name, column in made.items()
+    ]
+    return tuple(message.cls(**dict(zip(made, row, strict=True))) for row in zip(*columns, strict=True))
 
 
 def _scalar(path: str, kind: type, value: Any) -> Any:
@@ -249,11 +273,14 @@ class Part:
             self.leaves.append(dataclasses.replace(leaf, offset=offset))
             offset += leaf.size
         tags = [leaf.tag for leaf in leaves]
-        self._gather, self._absent = _compile(message, n, name, tags), _with_tags(tags, _absent(message))
+        self._absent = _with_tags(tags, _absent(message))
+        names: dict[str, Any] = {"_misfit": _misfit}
+        source = _gather(message, n, name, "it", iter(tags), names)
+        self._gather: Callable[[Any], tuple[Any, ...]] = eval(f"lambda it: ({source})", names)
 
     def pack_into(self, record: bytearray | memoryview, obj: Any) -> None:
-        row = self._absent if obj is None else self._gather(obj)
         try:
+            row = self._absent if obj is None else self._gather(obj)
             self._struct.pack_into(record, self.offset, *row)
         except struct.error as error:
             raise RecordError(f"{self.name}: a number does not fit into the record: {error}") from error
@@ -272,6 +299,13 @@ class Part:
 
 
 # --- from the table to protobuf --------------------------------------------------------------------------------------
+
+
+COLUMN_TYPES = {
+    "<f8": FieldProto.TYPE_DOUBLE,
+    "<i8": FieldProto.TYPE_SFIXED64,
+    "<u8": FieldProto.TYPE_FIXED64,
+}
 
 
 def add_field(into: descriptor_pb2.DescriptorProto, name: str, number: int, kind: int, type_name: str = "") -> None:
@@ -293,7 +327,7 @@ def describe(file: descriptor_pb2.FileDescriptorProto, message: Message) -> str:
         add_field(made, field, next(numbers), _wire(kind)[2], enum)
     for field, array in message.arrays.items():
         column = made.field.add(name=field, number=next(numbers), label=FieldProto.LABEL_REPEATED)
-        column.type = FieldProto.TYPE_DOUBLE if array.dtype == "<f8" else FieldProto.TYPE_SFIXED64
+        column.type = COLUMN_TYPES[array.dtype]
         column.options.packed = True
     for field, inner in message.messages.items():
         add_field(made, field, next(numbers), FieldProto.TYPE_MESSAGE, describe(file, inner))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +12,51 @@ from google.protobuf.message import DecodeError
 
 from asc_rt import human_state_pb2 as pb
 from asc_rt.cell_checks import hash_number
-from asc_rt.core.types import MAX_CAPSULES, Health, HumanState, IntVector, Matrix, Visibility, vector
+from asc_rt.core.fusion import unsure
+from asc_rt.core.types import (
+    MAX_CAPSULES,
+    Health,
+    HumanState,
+    IntVector,
+    Matrix,
+    MessageFault,
+    Visibility,
+    vector,
+)
 
 SCHEMA_VERSION = 1
 FRAME = "robot_base"
 DIGEST_SIZE = 32  # SHA-256
 INT64_MAX = 2**63 - 1
+SIGMA_MAX_NS = 10_000_000_000  # such a stamp says nothing
 
 
 class HumanCodecError(Exception):
-    """The message is not a HumanState that may be used."""
+    """The message is not a HumanState that may be used; `fault`: what the decision is told of it."""
+
+    def __init__(self, message: str, fault: MessageFault = MessageFault.UNREADABLE) -> None:
+        super().__init__(message)
+        self.fault = fault
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A message that may be used."""
+
+    state: HumanState  # grown by what the error of its stamp may hide
+    session: str
+    sigma_ns: int  # how far its capture stamp may be off our clock
 
 
 def clock_id() -> str:
-    """Names the clock of our stamps: monotonic time of this boot of this machine."""
-    return f"HOST_MONO:{Path('/proc/sys/kernel/random/boot_id').read_text().strip()}"
+    """Names the clock of our stamps: monotonic time of this boot of this machine. A container may have one of its own:
+    hence the time namespace."""
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return f"HOST_MONO:{boot}:{os.readlink('/proc/self/ns/time')}"
 
 
-def decode(data: bytes, clock: str) -> tuple[HumanState, str]:
-    """The state in `data`, stamped by the clock named `clock`, and its session. HumanCodecError: what is wrong."""
+def decode(data: bytes, clock: str) -> Heard:
+    """The message in `data`, if it is stamped by the clock named `clock`. HumanCodecError: what is wrong."""
     try:
         message = pb.HumanState.FromString(data)
     except DecodeError as error:
@@ -60,18 +88,20 @@ def decode(data: bytes, clock: str) -> tuple[HumanState, str]:
         visibility=_visibilities([c.visibility for c in capsules]),
     )
     _check_numbers(state)
-    return state, message.session_uuid
+    sigma_ns = message.t_capture_sigma_ns
+    return Heard(unsure(state, sigma_ns * 1e-9), message.session_uuid, sigma_ns)
 
 
 def _check_header(message: pb.HumanState, clock: str) -> None:
     if message.schema_version != SCHEMA_VERSION:
-        raise HumanCodecError(f"schema version {message.schema_version}, not {SCHEMA_VERSION}")
+        wrong = f"schema version {message.schema_version}, not {SCHEMA_VERSION}"
+        raise HumanCodecError(wrong, MessageFault.SCHEMA)
     if message.clock_id != clock:
-        raise HumanCodecError(f"stamps of clock {message.clock_id!r}, not of {clock!r}")
+        raise HumanCodecError(f"stamps of clock {message.clock_id!r}, not of {clock!r}", MessageFault.CLOCK)
     if message.frame_id != FRAME:
         raise HumanCodecError(f"frame {message.frame_id!r}, not {FRAME!r}")
     if message.safety_rated:
-        raise HumanCodecError("claims to be safety rated; nothing here is")
+        raise HumanCodecError("claims to be safety rated; nothing here is", MessageFault.SENDER)
     if len(message.calibration_hash) not in (0, DIGEST_SIZE):
         raise HumanCodecError(f"calibration hash of {len(message.calibration_hash)} bytes, not {DIGEST_SIZE}")
     if message.health not in {*Health}:
@@ -80,6 +110,8 @@ def _check_header(message: pb.HumanState, clock: str) -> None:
         raise HumanCodecError(f"sequence number {message.seq} is not within 1..{INT64_MAX}")
     if message.t_capture_ns <= 0:
         raise HumanCodecError(f"capture stamp {message.t_capture_ns} ns")
+    if message.t_capture_sigma_ns > SIGMA_MAX_NS:
+        raise HumanCodecError(f"a capture stamp that may be off by {message.t_capture_sigma_ns} ns")
 
 
 def _check_numbers(state: HumanState) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from asc_rt import topics
 from asc_rt.bus import Bus, BusError, open_router
 from asc_rt.config import Cell
 
@@ -64,6 +66,8 @@ def table(cell: Cell, ring: Path, log: Path) -> dict[str, Spec]:
     specs = [Spec("logger", logger, Death.SESSION_ENDS, outlives_us=True)]
     if cell.simulated:
         specs += [Spec(device, ("-m", "sim_hil", device, path, *overrides), Death.ROBOT_STOPS) for device in cell.sim]
+    if cell.perception is not None and not cell.perception.remote:
+        specs.append(Spec(topics.PERCEPTION, ("-m", "asc_rt.perception", path, *overrides), Death.ROBOT_STOPS))
     control = ("-m", "asc_rt.control", path, "--ring", str(ring), *overrides)
     return {spec.name: spec for spec in [*specs, Spec("control", control, Death.SESSION_OVER)]}
 
@@ -88,6 +92,10 @@ class Processes:
         """None: it runs, or was never started."""
         process = self._running.get(name)
         return None if process is None else process.code
+
+    def cpu_s(self) -> dict[str, float]:
+        """Seconds of a core that each has used so far, all its threads; of those that run."""
+        return {name: s for name, process in self._running.items() if (s := _cpu_s(process.popen.pid)) is not None}
 
     def newly_ended(self) -> Iterator[Process]:
         """Every process that has ended, once."""
@@ -130,23 +138,37 @@ class Processes:
 
 
 def run_device(cell: Cell, device: str, options: Sequence[str]) -> int:
-    """One simulated device of `cell` alone, until it ends or Ctrl-C; its exit code.
+    """One simulated device of `cell` alone, until it ends or Ctrl-C; its exit code."""
+    return _run_alone(cell, ("-m", "sim_hil", device, str(cell.path), *_overrides(cell), *options))
 
-    A device speaks on the bus, so one is made for it; where one is there already (a cell is running), it joins that.
-    """
+
+def run_perception(cell: Cell, remote: bool) -> int:
+    """The perception process of `cell` alone, until it ends or Ctrl-C; its exit code."""
+    argv = ("-m", "asc_rt.perception", str(cell.path), *_overrides(cell))
+    return _wait(_child([*argv, "--remote"])) if remote else _run_alone(cell, argv)
+
+
+def _run_alone(cell: Cell, argv: Sequence[str]) -> int:
+    """Who speaks on the bus needs one: made here, unless a cell is running and has one already."""
     try:
         router: Bus | None = open_router(cell.bus_endpoint)
     except BusError:
         router = None
-    argv = [sys.executable, "-m", "sim_hil", device, str(cell.path), *_overrides(cell), *options]
-    device_process = subprocess.Popen(argv, preexec_fn=_end_with_parent)
     try:
-        while True:
-            with suppress(KeyboardInterrupt):  # Ctrl-C reaches the device too, and it ends by itself
-                return device_process.wait()
+        return _wait(_child(argv))
     finally:
         if router is not None:
             router.close()
+
+
+def _wait(process: subprocess.Popen[bytes]) -> int:
+    while True:
+        with suppress(KeyboardInterrupt):  # Ctrl-C reaches it too, and it ends by itself
+            return process.wait()
+
+
+def _child(argv: Sequence[str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, *argv], preexec_fn=_end_with_parent)
 
 
 def describe(code: int) -> str:
@@ -156,6 +178,15 @@ def describe(code: int) -> str:
 
 def _overrides(cell: Cell) -> tuple[str, ...]:
     return tuple(part for item in cell.overrides for part in ("--set", item))
+
+
+def _cpu_s(pid: int) -> float | None:
+    """User and system time of a process, s; None: it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    except OSError:
+        return None
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _end_with_parent() -> None:

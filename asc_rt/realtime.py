@@ -30,6 +30,13 @@ def one_blas_thread() -> None:
         os.environ[variable] = "1"
 
 
+def leave(cpu: int | None) -> None:
+    """This process, and all that it starts, leaves core `cpu` to the loop, which pins itself there: whoever else has a
+    real-time priority must not be able to hold it up. With no other core nothing changes."""
+    if others := os.sched_getaffinity(0) - {cpu}:
+        os.sched_setaffinity(0, others)
+
+
 def set_up(priority: int, cpu: int | None) -> dict[str, Any]:
     """Priority, core, memory, timer, garbage collector. The report: what was achieved, and `missing` with reasons."""
     missing: list[str] = []

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from google.protobuf import descriptor_pb2
 
+from asc_rt.core.params import MAX_SENSORS
 from asc_rt.core.types import (
     MAX_CAPSULES,
     MAX_PAIRS,
@@ -28,14 +29,16 @@ from asc_rt.core.types import (
     Goal,
     Health,
     HumanState,
-    IntVector,
     JointCommand,
     JointState,
+    MessageFault,
     Mode,
+    Monitor,
     OperatorEvent,
     Pairs,
     RobotFlag,
     SafetyDecision,
+    SensorReport,
     Status,
     StopReason,
     StopRequest,
@@ -45,8 +48,10 @@ from asc_rt.fixed_protobuf import (
     FIXED32,
     INDICES,
     JOINTS,
+    NUMBERS,
     PACKAGE,
     POINTS,
+    Array,
     Buffer,
     FieldProto,
     Leaf,
@@ -74,34 +79,15 @@ class Timings:
     t_write_end_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class Events:
-    """The operator events of a cycle as columns."""
-
-    id: IntVector
-    kind: IntVector
-
-    @classmethod
-    def of(cls, events: tuple[OperatorEvent, ...]) -> Events:
-        if not events:
-            return NO_EVENTS
-        return cls(np.array([e.id for e in events], np.int64), np.array([e.kind for e in events], np.int64))
-
-    def rows(self) -> tuple[OperatorEvent, ...]:
-        return tuple(OperatorEvent(int(i), EventKind(k)) for i, k in zip(self.id, self.kind, strict=True))
-
-
-NO_EVENTS = Events(np.zeros(0, np.int64), np.zeros(0, np.int64))
-
-
 # --- the table -------------------------------------------------------------------------------------------------------
 
 GOAL = {"id": int, "q": JOINTS}
 STATE = Message(
     CoreState,
     {
-        "tick": int, "mode": Mode, "reason": StopReason, "reached_id": int, "event_id": int, "silent_cycles": int,
-        "ending": bool, "q_cmd": JOINTS, "dq_cmd": JOINTS, "ddq_cmd": JOINTS, "goal": Message(Goal, GOAL),
+        "tick": int, "mode": Mode, "reason": StopReason, "slow": StopReason, "reached_id": int, "event_id": int,
+        "silent_cycles": int, "ending": bool, "tool": int, "q_cmd": JOINTS, "dq_cmd": JOINTS, "ddq_cmd": JOINTS,
+        "goal": Message(Goal, GOAL),
     },
 )  # fmt: skip
 JOINT = Message(
@@ -123,29 +109,43 @@ HUMAN = Message(
     optional=True,
     capacity=MAX_CAPSULES,
 )  # fmt: skip
+EVENT = {"id": INDICES, "kind": Array("<i8", kind=EventKind), "tool": INDICES}
+SENSOR = {
+    "id": INDICES, "seq": INDICES, "age_ns": INDICES, "sigma_ns": INDICES, "fault": Array("<i8", kind=MessageFault),
+    "health": Array("<i8", kind=Health), "says_nothing": Array("<i8", kind=bool), "coverage": COLUMN,
+    "calibration_hash": NUMBERS,
+}  # fmt: skip
 INPUTS = Message(
     CycleInputs,
     {
-        "tick": int, "t_ns": int, "period_ns": int, "human_age_ns": int, "human_fault": bool, "missed_ticks": int,
+        "tick": int, "t_ns": int, "period_ns": int, "human_age_ns": int, "missed_ticks": int,
         "late": bool, "joint": JOINT, "human": HUMAN, "goal": Message(Goal, GOAL, optional=True),
-        "events": Message(
-            Events, {"id": INDICES, "kind": INDICES}, capacity=MAX_EVENTS, encode=Events.of, decode=Events.rows
-        ),
+        "events": Message(OperatorEvent, EVENT, capacity=MAX_EVENTS, rows=True),
+        "sensors": Message(SensorReport, SENSOR, capacity=MAX_SENSORS, rows=True),
     },
 )  # fmt: skip
 PAIRS = Message(
     Pairs,
     {
         "robot": INDICES, "human": INDICES, "d": COLUMN, "d_dot": COLUMN, "M": COLUMN, "M_dot": COLUMN, "phi": COLUMN,
-        "phi_dot": COLUMN, "floor": COLUMN, "achieved": COLUMN, "basis": INDICES,
+        "phi_dot": COLUMN, "floor": COLUMN, "achieved": COLUMN, "basis": INDICES, "outside": INDICES,
     },
     capacity=MAX_PAIRS,
+)  # fmt: skip
+MONITOR = Message(
+    Monitor,
+    {
+        "distance": float, "protective_distance": float, "robot_speed": float, "age": float, "reaction_time": float,
+        "stopping_time": float,
+    },
+    optional=True,
 )  # fmt: skip
 DECISION = Message(
     SafetyDecision,
     {
         "status": Status, "reason": StopReason, "pair_count": int, "iterations": int, "share": float,
-        "d_measured": float, "u_ref": JOINTS, "u_safe": JOINTS, "pairs": PAIRS,
+        "d_measured": float, "d_goal": float, "u_ref": JOINTS, "u_safe": JOINTS, "pairs": PAIRS,
+        "monitor": MONITOR,
     },
 )  # fmt: skip
 COMMAND = Message(
@@ -214,9 +214,10 @@ class RecordLayout:
         for part, obj in zip(self._parts, (before, inputs, outputs, receipt, timings), strict=True):
             part.pack_into(into, obj)
 
-    def seal(self, record: bytearray | memoryview) -> None:
-        """Write the check that belongs to the bytes before it."""
-        struct.pack_into("<I", record, self._check_offset, zlib.crc32(memoryview(record)[: self._checked]))
+    def sealed(self, record: Buffer) -> bytes:
+        """The record with the check that belongs to the bytes before it."""
+        view = memoryview(record)
+        return b"".join((view[: self._check_offset], zlib.crc32(view[: self._checked]).to_bytes(CHECK_SIZE, "little")))
 
     def syndrome(self, record: Buffer) -> int:
         """CRC of the bytes XOR the CRC that the record carries: 0 as written."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
@@ -165,10 +164,17 @@ class RingReader(_Ring):
             self._words[_LOST] += 1
         return None
 
-    def drain(self) -> Iterator[bytes]:
-        """All that is there now."""
-        while (payload := self.take()) is not None:
-            yield payload
+    def drain(self, limit: int = 100) -> list[bytes]:
+        """The oldest payloads not yet taken, up to `limit`; none: there are no more."""
+        while self._next < (head := self.head):
+            end = min(head, self._next + limit)
+            copies = [self._slot(index) for index in range(self._next, end)]
+            self._next = end
+            found = [payload for payload in copies if payload is not None]
+            self._words[_LOST] += len(copies) - len(found)
+            if found:
+                return found
+        return []
 
     def commit(self) -> None:
         """What was taken so far is safe: a successor begins after it."""

@@ -7,25 +7,29 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from asc_rt import ring, topics
+from asc_rt import clock_sync, realtime, ring, topics
 from asc_rt.bus import Bus, open_router
 from asc_rt.config import Cell
 from asc_rt.console import Keyboard, Operator
-from asc_rt.core.types import EventKind
+from asc_rt.core.types import EventKind, StopReason
 from asc_rt.processes import Death, Process, Processes, Spec, describe, table
 from asc_rt.record import RecordLayout
+from asc_rt.remote import door
+from asc_rt.stop_hints import HINTS
 
 READY_TIMEOUT_S = 180.0  # of one process, compiling included: 40 s of CPU the first time, on a loaded machine
 CONTROL_END_TIMEOUT_S = 15.0
 LAST_WORDS_S = 1.0  # for what the control process said last to arrive
 POLL_S = 0.02
 BAR = "{l_bar}{bar}| {n:.0f}/{total:.0f} s"
+SAY_READY = (*topics.SIM_DEVICES, topics.PERCEPTION)
 
 
 class StartError(Exception):
@@ -41,6 +45,7 @@ class Session:
     control_code: int | None = None
     end: dict[str, Any] = field(default_factory=dict)  # what the control process said last
     deaths: list[str] = field(default_factory=list)  # processes that ended before they were asked to
+    cpu_share: dict[str, float] = field(default_factory=dict)  # of one core, by process, while the cell ran
     recorded: bool = True  # the logger lived to the end
 
     @property
@@ -57,20 +62,30 @@ class Session:
         return str(self.end.get("reason", "CONTROL_DIED")) if logged in ("UNFINISHED", "SESSION_END") else logged
 
 
-def run_cell(cell: Cell, log: Path, duration_s: float | None) -> Session:
-    """Run `cell` for `duration_s`, or until Ctrl-C, and record it to `log`.
+def cell_operator(bus: Bus, cell: Cell) -> Operator:
+    """Works through the goals of the cell; arms a simulated one."""
+    events, goals = bus.event_publisher(topics.OPERATOR.key), bus.event_publisher(topics.GOAL.key)
+    return Operator(events, goals, cell.goals, arms_itself=cell.simulated)
+
+
+def run_cell(
+    cell: Cell, log: Path, duration_s: float | None, operator: Callable[[Bus, Cell], Operator] = cell_operator
+) -> Session:
+    """Run `cell` for `duration_s`, or until Ctrl-C or until `operator` is done, and record it to `log`.
 
     BusError, RingError: nothing was started. StartError: a process did not become ready; all are ended.
     """
+    realtime.leave(cell.realtime.cpu)
     ring_path = Path(f"/dev/shm/asc-{cell.name}-{os.getpid()}")
     session = Session(log)
-    with open_router(cell.bus_endpoint) as bus:
+    with open_router(cell.bus_endpoint, door(cell)) as bus:
+        bus.answer(topics.CLOCK.key, clock_sync.answer)
         ring.create_session(ring_path, RecordLayout(cell.params.n).size, cell.params.period_ns)
         processes = Processes()
         interrupts: list[int] = []
         old = {s: signal.signal(s, lambda n, _: interrupts.append(n)) for s in (signal.SIGINT, signal.SIGTERM)}
         try:
-            _Supervisor(cell, bus, processes, session, interrupts).run(ring_path, duration_s)
+            _Supervisor(cell, operator(bus, cell), bus, processes, session, interrupts).run(ring_path, duration_s)
         finally:
             processes.end_all_but_logger()
             ring.RingWriter(ring_path).close()  # on behalf of a control process that was killed
@@ -87,19 +102,29 @@ def run_cell(cell: Cell, log: Path, duration_s: float | None) -> Session:
 
 
 class _Supervisor:
-    def __init__(self, cell: Cell, bus: Bus, processes: Processes, session: Session, interrupts: list[int]) -> None:
-        self._cell, self._processes, self._session, self._interrupts = cell, processes, session, interrupts
+    def __init__(
+        self,
+        cell: Cell,
+        operator: Operator,
+        bus: Bus,
+        processes: Processes,
+        session: Session,
+        interrupts: list[int],
+    ) -> None:
+        self._cell, self._operator, self._processes = cell, operator, processes
+        self._session, self._interrupts = session, interrupts
         self._state_box = bus.latest(topics.STATE.key)
         self._control_box = bus.queue(topics.CONTROL.key)
-        self._device_boxes = {name: bus.latest(topic.key) for name, topic in topics.SIM_DEVICES.items()}
-        events, goals = bus.event_publisher(topics.OPERATOR.key), bus.event_publisher(topics.GOAL.key)
-        self._operator = Operator(events, goals, cell.goals, arms_itself=cell.simulated)
+        self._device_boxes = {name: bus.latest(topics.ready(name).key) for name in SAY_READY}
         self._keyboard = None if cell.simulated else Keyboard()
         self._said: tuple[Any, ...] = ()
 
     def run(self, ring_path: Path, duration_s: float | None) -> None:
         self._start(ring_path)
+        began, before = time.monotonic(), self._processes.cpu_s()
         self._operate(duration_s)
+        spent, seconds = self._processes.cpu_s(), time.monotonic() - began
+        self._session.cpu_share = {name: round((s - before.get(name, 0.0)) / seconds, 3) for name, s in spent.items()}
         self._finish()
 
     # --- start -------------------------------------------------------------------------------------------------------
@@ -153,11 +178,11 @@ class _Supervisor:
         """Until the duration is over, somebody interrupts, or a process ends that the session needs."""
         started = time.monotonic()
         if self._keyboard:
-            print("type arm, stop or end", file=sys.stderr)
+            print("type arm, stop or end; tool NUMBER says which tool is mounted", file=sys.stderr)
         with tqdm(total=duration_s, unit="s", disable=None, bar_format=None if duration_s is None else BAR) as bar:
             while not self._interrupts and not self._must_end():
                 elapsed = time.monotonic() - started
-                if duration_s is not None and elapsed >= duration_s:
+                if self._operator.is_done or (duration_s is not None and elapsed >= duration_s):
                     return
                 bar.update(elapsed - bar.n)
                 self._hear_state()
@@ -170,19 +195,24 @@ class _Supervisor:
             return
         state = json.loads(data)
         self._operator.hear(state, time.monotonic())
+        while self._operator.takes_away:
+            self._processes.end(self._operator.takes_away.pop())
         said = (state["mode"], state["reason"], state["reached_id"])
         if said != self._said:
             self._said = said
-            reason = "" if state["reason"] == "NONE" else f" ({state['reason']})"
+            hint = HINTS.get(StopReason[state["reason"]], "")
+            reason = f" ({state['reason']}: {hint})" if hint else ""
             tqdm.write(f"{state['mode']}{reason}, goals reached: {state['reached_id']}", file=sys.stderr)
 
     def _type(self, keyboard: Keyboard) -> bool:
         """Act on what a person typed; True: end the session."""
         typed = keyboard.read()
-        if isinstance(typed, EventKind) and typed is not EventKind.END:
+        if isinstance(typed, int) and not isinstance(typed, EventKind):
+            self._operator.say(EventKind.TOOL, typed)
+        elif isinstance(typed, EventKind) and typed is not EventKind.END:
             self._operator.say(typed)
         elif isinstance(typed, str) and typed:
-            print(f"{typed!r}? type arm, stop or end", file=sys.stderr)
+            print(f"{typed!r}? type arm, stop, end or tool NUMBER", file=sys.stderr)
         return typed is EventKind.END
 
     def _must_end(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -9,6 +10,7 @@ from enum import StrEnum
 class Delivery(StrEnum):
     LATEST = "latest"  # a newer message replaces an older one
     QUEUE = "queue"  # every message counts, in order; ids increase
+    ASKED = "asked"  # answered by the supervisor
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,21 +22,54 @@ class Topic:
     meaning: str
 
 
-HUMAN = Topic("cell/human", "asc.v1.HumanState", 60, Delivery.LATEST, "people near the robot, with bounds")
-OPERATOR = Topic("cell/operator", "json", 0, Delivery.QUEUE, '{"id": int, "kind": "ARM" | "STOP" | "END"}')
+HUMAN = Topic("cell/human/*", "asc.v1.HumanState", 60, Delivery.LATEST, "people near the robot; each sensor: `human`")
+OPERATOR = Topic(
+    "cell/operator", "json", 0, Delivery.QUEUE, '{"id": int, "kind": "ARM" | "STOP" | "END" | "TOOL", "tool": int}'
+)
 GOAL = Topic("cell/goal", "json", 0, Delivery.LATEST, '{"id": int, "q": [rad, ...]}')
 STATE = Topic("cell/state", "json", 10, Delivery.LATEST, "newest cycle, republished by the logger")
+JOINTS = Topic(
+    "cell/joints", "json", 50, Delivery.QUEUE, '{"t_ns": [int, ...], "q": [[rad, ...], ...]}: measured; from the logger'
+)
 CONTROL = Topic("cell/control", "json", 0, Delivery.QUEUE, "start, end and errors of the control process")
+CLOCK = Topic("cell/clock", "json", 1, Delivery.ASKED, '{"id": str, "t_ns": int}: this machine\'s monotonic clock')
+FAULT = Topic("sim/fault", "json", 0, Delivery.QUEUE, "a fault of the simulated robot, as in its script, now")
 CAMERA = Topic("cell/camera", "foxglove.CompressedImage", 15, Delivery.QUEUE, "what cameras see; frame_id: which")
+CAMERA_CALIBRATION = Topic(
+    "cell/camera_calibration", "foxglove.CameraCalibration", 1, Delivery.QUEUE, "their lenses; frame_id: which camera"
+)
 PERSON_TRUTH = Topic("sim/person", "asc.v1.HumanState", 125, Delivery.LATEST, "where the simulated person really is")
 PLANT_TRUTH = Topic("sim/truth", "json", 125, Delivery.LATEST, "what the plant really did: q, dq, distance, contact")
 
-# The simulated devices that a cell may have as [sim.*], and by what one can hear that they run.
-SIM_DEVICES = {"fanuc": PLANT_TRUTH, "human": PERSON_TRUTH}
+SIM_DEVICES = ("fanuc", "can", "human", "camera")  # that a cell may have as [sim.*]; each says that it is `ready`
+PERCEPTION = "perception"  # says so, too
 
-TOPICS = (HUMAN, OPERATOR, GOAL, STATE, CONTROL, CAMERA, PERSON_TRUTH, PLANT_TRUTH)
+TOPICS = (
+    HUMAN, OPERATOR, GOAL, STATE, JOINTS, CONTROL, CLOCK, CAMERA, CAMERA_CALIBRATION, PERSON_TRUTH, PLANT_TRUTH, FAULT,
+)  # fmt: skip
+
+
+def human(sensor: str) -> Topic:
+    """Where the sensor of that name, one of the cell's human.sensors, says which people it sees."""
+    return dataclasses.replace(HUMAN, key=f"cell/human/{sensor}")
 
 
 def ready(device: str) -> Topic:
-    """Said again and again by a simulated device from the moment it can be used."""
-    return Topic(f"sim/ready/{device}", "json", 2, Delivery.LATEST, f"simulated {device} can be used")
+    """Said again and again by a simulated device, or by perception, from the moment it can be used."""
+    return Topic(f"cell/ready/{device}", "json", 2, Delivery.LATEST, f"{device} can be used")
+
+
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """The keys that a peer on another machine may use; every other one is denied."""
+
+    says: tuple[str, ...]
+    hears: tuple[str, ...]
+    asks: tuple[str, ...]
+
+
+def rights(sensor: str) -> Rights:
+    """Of a sensor of people: it says whom it sees and shows its images, and hears where the arm is, to tell it from
+    them; it can neither arm nor set goals."""
+    says = (human(sensor).key, CAMERA.key, CAMERA_CALIBRATION.key)
+    return Rights(says=says, hears=(JOINTS.key,), asks=(CLOCK.key,))

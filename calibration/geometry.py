@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 
 def skew(v: np.ndarray) -> np.ndarray:
@@ -71,3 +72,15 @@ def difference(T: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(..., 6) xi with perturb(origin, xi) = T."""
     w = log(T[..., :3, :3] @ np.swapaxes(origin[..., :3, :3], -1, -2))
     return np.concatenate([T[..., :3, 3] - origin[..., :3, 3], w], -1)
+
+
+def look_at(eye: npt.ArrayLike, target: npt.ArrayLike) -> np.ndarray:
+    """(4, 4) T_base_cam of a level camera at `eye` that looks at `target`."""
+    forward = np.subtract(target, eye, dtype=float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = eye
+    return T

@@ -14,18 +14,24 @@ Eye-in-hand is the same equation with the robot's poses inverted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calibration.geometry import difference, inverse, log, perturb, pose, skew
 from calibration.result import CalibrationError, Result, pose_value, rows
+from calibration.touch import Touch
 
 LEAST_POSES = 8
+HOLD_OUT = 4  # the last views; they take no part in the fit
 LEAST_ROTATION_DEG = 30.0  # spread about the second-best axis; below it the translation is ill-determined
 GROSS = 10.0  # chi2 per degree of freedom beyond which no more need be asked
+SQUARE_SIGMA = 5e-4  # of the square's side, ASSUMED: 0.1 mm on a board 250 mm wide, read off a steel rule
+WIDE = 0.1  # prior of a board of unknown size
+MOST_SQUARE = 4.0  # sigma
 CHI2_TAIL = 1e-3  # share of good calibrations that the test refuses
 
 
@@ -50,7 +56,7 @@ class Views:
     covariance: np.ndarray  # (n, 6, 6) of `board`, parent's axes (see calibration.geometry.perturb)
     lens: (
         np.ndarray
-    )  # (n, 6, k) how `board` moves with the k errors that all views share (intrinsics), of unit variance
+    )  # (n, 6, k) how `board` moves with the k errors that all views share (intrinsics, square), of unit variance
 
     def subset(self, keep: np.ndarray) -> Views:
         return Views(self.flange[keep], self.board[keep], self.covariance[keep], self.lens[keep])
@@ -66,6 +72,8 @@ class Solution:
     covariance: np.ndarray  # (12, 12): base_cam, flange_board
     chi2: float
     dof: int
+    shared: np.ndarray  # (k,) the errors that all views share, in their prior sigmas
+    shared_sigma: np.ndarray  # (k,) what is left of them
 
     @property
     def chi2_dof(self) -> float:
@@ -114,8 +122,9 @@ def solve(views: Views, noise: RobotNoise) -> Solution:
         if 2 * found.cost > GROSS * 6 * len(views):  # no calibration: it will be refused
             break
     J = _jacobian(whitened, at)
-    covariance = np.linalg.inv(J.T @ J)[:12, :12]
-    return Solution(Z0, X0, covariance, float(2 * found.cost), 6 * len(views) - 12)
+    C = np.linalg.inv(J.T @ J)
+    left = np.sqrt(np.diag(C)[12:])
+    return Solution(Z0, X0, C[:12, :12], float(2 * found.cost), 6 * len(views) - 12, at[12:], left)
 
 
 def _jacobian(f: object, x: np.ndarray, h: float = 1e-6) -> np.ndarray:
@@ -135,7 +144,7 @@ def _residual_covariance(views: Views, Z: np.ndarray, X: np.ndarray, noise: Robo
 
 
 def calibrate(
-    views: Views, noise: RobotNoise | None = None, hold_out: int = 4, touch: Touch | None = None
+    views: Views, noise: RobotNoise | None = None, hold_out: int = HOLD_OUT, touch: Touch | None = None
 ) -> tuple[Result, Solution]:
     """The result for a camera beside the robot, accepted or with every reason against it.
 
@@ -153,16 +162,16 @@ def calibrate(
     solution = solve(fit, noise)
     quality: dict[str, object] = {
         "poses": len(fit),
-        "rotation_deg": rotation_spread(fit),
+        "rotation_deg": rotation_spread(fit.flange[:, :3, :3]),
         "chi2_dof": solution.chi2_dof,
         "rms": _rms(solution, fit),
         "holdout": _rms(solution, held),
         "holdout_chi2_dof": _chi2(solution, held, noise) / (6 * hold_out),
         "jack_knife_mm": jack_knife(fit, noise, solution) if solution.chi2_dof < GROSS else None,
     }
-    reasons = _reasons(fit, solution, quality, hold_out)
+    reasons = _reasons(fit, noise, solution, quality, hold_out)
     if touch is not None:
-        quality["touch_mm"], against = touch.compare(solution)
+        quality["touch_mm"], against = touch.compare(solution.T_base_cam, solution.covariance[:6, :6])
         reasons += against
     result = Result(
         "hand-eye", "T_base_cam", pose_value(solution.T_base_cam), rows(solution.covariance[:6, :6]),
@@ -172,10 +181,10 @@ def calibrate(
     return result, solution
 
 
-def rotation_spread(views: Views) -> float:
-    """deg: the spread of orientation about the second-best axis, from the rotations between all pairs of poses."""
-    i, j = np.triu_indices(len(views), 1)
-    w = log(views.flange[i, :3, :3] @ np.swapaxes(views.flange[j, :3, :3], -1, -2))
+def rotation_spread(R: np.ndarray) -> float:
+    """deg: the spread of orientations (n, 3, 3) about the second-best axis, from the rotations between all pairs."""
+    i, j = np.triu_indices(len(R), 1)
+    w = log(R[i] @ np.swapaxes(R[j], -1, -2))
     middle = np.linalg.eigvalsh(w.T @ w / len(w))[1]
     return float(np.degrees(np.sqrt(middle) * 2))
 
@@ -186,10 +195,16 @@ def _rms(solution: Solution, views: Views) -> float:
     return float(np.sqrt(np.mean(np.sum((predicted[:, :3, 3] - views.board[:, :3, 3]) ** 2, axis=1))))
 
 
-def _chi2(solution: Solution, views: Views, noise: RobotNoise) -> float:
+def whitened_residuals(solution: Solution, views: Views, noise: RobotNoise) -> np.ndarray:
+    """(n, 6) in sigma: of unit variance if everything was said honestly."""
     Z, X = solution.T_base_cam, solution.T_flange_board
-    r = difference(views.board, inverse(Z) @ views.flange @ X)
-    return float(np.einsum("ni,nij,nj", r, np.linalg.inv(_residual_covariance(views, Z, X, noise)), r))
+    r = difference(views.board, inverse(Z) @ views.flange @ X) - views.lens @ solution.shared
+    roots = np.linalg.cholesky(_residual_covariance(views, Z, X, noise))
+    return np.asarray(np.linalg.solve(roots, r[..., None])[..., 0])
+
+
+def _chi2(solution: Solution, views: Views, noise: RobotNoise) -> float:
+    return float(np.sum(whitened_residuals(solution, views, noise) ** 2))
 
 
 def jack_knife(views: Views, noise: RobotNoise, whole: Solution, groups: int = 5) -> float:
@@ -201,25 +216,26 @@ def jack_knife(views: Views, noise: RobotNoise, whole: Solution, groups: int = 5
     return float(1e3 * np.sqrt((groups - 1) / groups * np.sum(np.square(moved))))
 
 
-def _reasons(views: Views, solution: Solution, quality: dict[str, object], hold_out: int) -> list[str]:
+def _reasons(
+    views: Views, noise: RobotNoise, solution: Solution, quality: dict[str, object], hold_out: int
+) -> list[str]:
     reasons = []
-    spread = rotation_spread(views)
+    spread = rotation_spread(views.flange[:, :3, :3])
     if spread < LEAST_ROTATION_DEG:
         reasons.append(
             f"rotation {spread:.0f} deg about a second axis; turn the flange by {LEAST_ROTATION_DEG:.0f} or more"
         )
+    against: list[str] = []
     for name, value, dof in (
         ("chi2_dof", solution.chi2_dof, solution.dof),
         ("holdout_chi2_dof", float(quality["holdout_chi2_dof"]), 6 * hold_out),  # type: ignore[arg-type]
     ):
-        most = chi2.ppf(1 - CHI2_TAIL, dof) / dof
+        most = chdtri(dof, CHI2_TAIL) / dof
         if name != "chi2_dof":
             most *= 1.5  # the fit's own error comes on top of the held-out view's
-        if value > most:
-            reasons.append(
-                f"{name} {value:.3g} is above {most:.3g}: the poses and the pixels contradict each other; "
-                "look for swapped frames, wrong units or square size, a board that slipped, poses taken in motion"
-            )
+        if not value <= most:
+            against.append(f"{name} {value:.3g} is above {most:.3g}: the poses and the pixels contradict each other")
+    reasons += [*against, *(explain(views, noise) if against else square_size(views, noise))]
     stated = 1e3 * float(np.sqrt(np.trace(solution.covariance[:3, :3])))
     if float(quality["jack_knife_mm"] or 0.0) > 4 * stated:  # type: ignore[arg-type]
         reasons.append(
@@ -228,23 +244,52 @@ def _reasons(views: Views, solution: Solution, quality: dict[str, object], hold_
     return reasons
 
 
-@dataclass(frozen=True, slots=True)
-class Touch:
-    """The independent check: corners of a board lying in the cell, touched with the calibrated tool tip."""
+def explain(views: Views, noise: RobotNoise) -> list[str]:
+    """Which usual mistake makes the contradiction go away? CalibrationError never: data that fit nothing say so."""
+    for spoiled, words in MISTAKES:
+        try:
+            found = solve(spoiled(views), noise)
+        except np.linalg.LinAlgError:
+            continue
+        if found.chi2_dof < GROSS:
+            return [words]
+    return square_size(views, noise) or [
+        "look for a board that slipped on the flange, poses taken in motion, pictures and poses out of order"
+    ]
 
-    tip: np.ndarray  # (m, 3) m in the base frame
-    seen: np.ndarray  # (m, 3) m in the camera frame
-    sigma: float = 1e-3  # m, of one touch
 
-    def compare(self, solution: Solution) -> tuple[float, list[str]]:
-        """mm rms, and the reason against if it is outside 3 sigma of camera and touch together."""
-        Z = solution.T_base_cam
-        p = self.seen @ Z[:3, :3].T
-        gaps = np.linalg.norm(p + Z[:3, 3] - self.tip, axis=1)
-        worst = 0.0
-        for gap, point in zip(gaps, p, strict=True):
-            J = np.hstack([np.eye(3), -skew(point)])
-            C = J @ solution.covariance[:6, :6] @ J.T + self.sigma**2 * np.eye(3)
-            worst = max(worst, gap / np.sqrt(np.trace(C)))
-        rms = float(1e3 * np.sqrt(np.mean(gaps**2)))
-        return rms, [f"touch check: {worst:.1f} sigma ({rms:.1f} mm) off; at most 3"] if worst > 3 else []
+def _stretched(T: np.ndarray, factor: float) -> np.ndarray:
+    return pose(T[:, :3, :3], factor * T[:, :3, 3])
+
+
+MISTAKES: tuple[tuple[Callable[[Views], Views], str], ...] = (
+    (
+        lambda v: replace(v, flange=inverse(v.flange)),  # a camera on the flange obeys the same equation
+        "swapped frames: the poses fit as T_flange_base; T_base_flange is needed, and the board on the flange",
+    ),
+    (
+        lambda v: replace(v, flange=_stretched(v.flange, 1e-3)),
+        "wrong units: the robot's poses are millimetres; metres are needed",
+    ),
+    (
+        lambda v: replace(v, flange=_stretched(v.flange, 1e3)),
+        "wrong units: the robot's poses are 1000 times too small; metres are needed",
+    ),
+)
+
+
+def with_square(views: Views, sigma: float) -> Views:
+    """The board's size as one more unknown that all views share, known to the share `sigma`."""
+    column = np.zeros((len(views), 6, 1))
+    column[:, :3, 0] = sigma * views.board[:, :3, 3]
+    return replace(views, lens=np.concatenate([views.lens, column], 2))
+
+
+def square_size(views: Views, noise: RobotNoise) -> list[str]:
+    """The robot's motion measures the board: the reason against a square size that it contradicts."""
+    found = solve(with_square(views, WIDE), noise)
+    error, sigma = WIDE * float(found.shared[-1]), WIDE * float(found.shared_sigma[-1])
+    if found.chi2_dof > GROSS or abs(error) < MOST_SQUARE * np.hypot(sigma, SQUARE_SIGMA):
+        return []
+    size = f"the robot's motion says {1 - error:.4f} +- {sigma:.4f} of the square size given"
+    return [f"wrong square size: {size}; measure the print over many squares"]

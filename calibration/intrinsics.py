@@ -20,7 +20,7 @@ from calibration.vision import Board, Detection
 CELLS = (6, 8)  # rows, columns of the coverage map
 LEAST_CORNERS = 12  # of a view
 LEAST_VIEWS = 12
-LEAST_SHARPNESS = 60.0  # variance of the Laplacian of a picture of 8 bits; ASSUMED, blurred boards are below 30
+MOST_BLUR = 1.8  # px, sigma of an edge; MEASURED: rendered boards blurred by 2 px keep 2 to 9 of 40 corners
 LEAST_TILT_DEG = 30.0
 LEAST_COVERAGE = 0.9
 MOST_SIGMA_F = 2.0  # px
@@ -58,7 +58,7 @@ def look(images: dict[str, np.ndarray], board: Board) -> Pictures:
 
 def unfit(image: np.ndarray, detection: Detection, board: Board) -> str:
     """Why this picture is of no use; empty: it is."""
-    if vision.sharpness(image) < LEAST_SHARPNESS:
+    if vision.edge_width(image) > MOST_BLUR:
         return "blurred; hold still, focus, shorten the exposure"
     if len(detection) >= LEAST_CORNERS:
         return ""
@@ -73,7 +73,7 @@ def calibrate(pictures: Pictures, board: Board) -> Result:
     if n < LEAST_VIEWS:
         few = f"views: {n} of {n + len(pictures.dropped)} can be used; at least {LEAST_VIEWS}"
         raise CalibrationError([few, *pictures.dropped])
-    fit = [d for i, d in enumerate(pictures.detections) if i % 4 != 3]
+    fit = fitted(pictures)
     held = [d for i, d in enumerate(pictures.detections) if i % 4 == 3]
     K, distortion, poses, rms = vision.calibrate_camera(fit, board, pictures.size)
     C = covariance(fit, board, K, distortion, poses)
@@ -83,7 +83,7 @@ def calibrate(pictures: Pictures, board: Board) -> Result:
         "coverage": float(np.mean(coverage(pictures) > 0)),
         "tilt_deg": tilt(poses),
         "holdout": float(np.sqrt(np.mean([vision.board_pose(d, board, K, distortion, 1.0)[2] ** 2 for d in held]))),
-        "edge_px": _half_set_difference(fit, board, pictures.size),
+        "edge_px": float(np.max(ray_difference(fit, board, pictures.size)[1])),
         "dropped": pictures.dropped,
     }
     value = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion)
@@ -134,14 +134,19 @@ def tilt(poses: list[np.ndarray]) -> float:
     return float(np.degrees(max(np.arccos(np.clip(a @ b, -1, 1)) for a, b in combinations(normals, 2))))
 
 
-def _half_set_difference(detections: list[Detection], board: Board, size: tuple[int, int]) -> float:
-    """px: largest difference of rays over the picture between the calibrations of the even and the odd views."""
+def fitted(pictures: Pictures) -> list[Detection]:
+    """All but every fourth view, which is held out."""
+    return [d for i, d in enumerate(pictures.detections) if i % 4 != 3]
+
+
+def ray_difference(detections: list[Detection], board: Board, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2) px over the picture, and (n,) px by which the rays of the even and of the odd views differ there."""
     grid = np.stack(np.meshgrid(np.linspace(0, size[0], 17), np.linspace(0, size[1], 13)), -1).reshape(-1, 2)
     halves = [vision.calibrate_camera(detections[k::2], board, size)[:2] for k in (0, 1)]
     a, b = (vision.rays(grid, K, d) for K, d in halves)
     U, _, Vt = np.linalg.svd(b.T @ a)
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    return float(np.max(np.linalg.norm(b - a @ R.T, axis=1)) * halves[0][0][0, 0])
+    return grid, np.linalg.norm(b - a @ R.T, axis=1) * halves[0][0][0, 0]
 
 
 def covariance(
@@ -173,10 +178,3 @@ def jacobians(
     lens = [(pixels(x + d, o) - pixels(x - d, o)) / (2 * d.sum()) for d in steps]
     pose = [(pixels(x, d) - pixels(x, -d)) / (2 * d.sum()) for d in 1e-6 * np.eye(6)]
     return np.stack(lens, 1), np.stack(pose, 1)
-
-
-def lens_effect(points: np.ndarray, T: np.ndarray, intrinsics: Result) -> np.ndarray:
-    """(6, 9) how a board's pose moves with the intrinsics' errors, each of unit variance."""
-    J_lens, J_pose = jacobians(points, T, intrinsics.camera_matrix(), intrinsics.distortion())
-    root = np.linalg.cholesky(np.array(intrinsics.covariance))
-    return np.asarray(-np.linalg.lstsq(J_pose, J_lens @ root, rcond=None)[0])

@@ -1,15 +1,17 @@
-"""Is every method's error bar honest? `python -m calibration.montecarlo -n 200` prints the table.
+"""Is every method's error bar honest? `python -m calibration.montecarlo -n 100` prints the tables of the README.
 
 Each row calibrates synthetic data with known truth n times. `ratio` is the root mean square of error / stated sigma
 over all components: 1 is honest, 2 claims twice what it holds. Hand-eye stands beside the closed form (Shah, which is
-OpenCV's CALIB_ROBOT_WORLD_HAND_EYE_SHAH) and beside OpenCV's own methods where the installed version has them.
+OpenCV's CALIB_ROBOT_WORLD_HAND_EYE_SHAH) and beside OpenCV's own methods where the installed version has them (5.0.0
+has none; `uv run --with opencv-python-headless==4.14.0.94 python -m calibration.montecarlo` puts one that has over it).
+The second table asks whether the tests of acceptance let good data pass and find bad ones.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -17,7 +19,8 @@ import numpy as np
 
 from asc_rt.config import load_arm
 from calibration import hand_eye, intrinsics, payload, synthetic, time_offset, tool
-from calibration.geometry import difference, inverse, pose
+from calibration.geometry import difference, inverse, perturb, pose
+from calibration.touch import Touch
 from calibration.vision import Board
 
 PIXEL = np.diag([2e-4, 2e-4, 1e-3, 1.5e-3, 1.5e-3, 3e-4]) ** 2  # of a board 1.3 m away, corners to 0.15 px
@@ -46,6 +49,15 @@ def row(method: str, condition: str, trial: Trial, n: int, lead: slice, scale: f
 
 def hand_eye_rows(n: int) -> Iterator[Row]:
     noise = hand_eye.RobotNoise()
+
+    def with_shared_errors(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        data, Z, _ = synthetic.views(rng, 20, 0.52, noise, PIXEL)
+        data = synthetic.shared_errors(rng, data)
+        found = hand_eye.solve(data, noise)
+        return difference(found.T_base_cam, Z), np.sqrt(np.diag(found.covariance)[:6])
+
+    condition = "20 poses, +-30 deg, lens and print wrong"
+    yield row("hand-eye, ours", condition, with_shared_errors, n, slice(3), 1e3, "mm")
     for views, tilt in ((10, 0.52), (20, 0.52), (20, 0.14), (40, 0.52)):
 
         def ours(rng: np.random.Generator, views: int = views, tilt: float = tilt) -> tuple[np.ndarray, np.ndarray]:
@@ -75,6 +87,8 @@ def others() -> dict[str, Method]:
     if hasattr(cv2, "calibrateHandEye"):
         for name in ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS"):
             methods[f"OpenCV {name}"] = partial(_opencv, getattr(cv2, f"CALIB_HAND_EYE_{name}"))
+        for name in ("SHAH", "LI"):
+            methods[f"OpenCV {name}"] = partial(_opencv_world, getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{name}"))
     return methods
 
 
@@ -85,6 +99,14 @@ def _opencv(method: int, views: hand_eye.Views) -> np.ndarray:
         list(flange[:, :3, :3]), list(flange[:, :3, 3]), list(board[:, :3, :3]), list(board[:, :3, 3]), method=method
     )
     return pose(np.asarray(R), np.asarray(t).reshape(3))
+
+
+def _opencv_world(method: int, views: hand_eye.Views) -> np.ndarray:
+    """T_cam_board T_board_flange = T_cam_base T_base_flange: the board is its world, our flange its base."""
+    A, B = views.board, views.flange
+    solve = getattr(cv2, "calibrateRobotWorldHandEye")  # noqa: B009 - this version's stubs lack it
+    found = solve(list(A[:, :3, :3]), list(A[:, :3, 3]), list(B[:, :3, :3]), list(B[:, :3, 3]), method=method)
+    return inverse(pose(np.asarray(found[2]), np.asarray(found[3]).reshape(3)))
 
 
 def other_rows(n: int) -> Iterator[Row]:
@@ -134,8 +156,51 @@ def photograph(rng: np.random.Generator, count: int, sigma: float = 0.15) -> tup
     return intrinsics.calibrate(intrinsics.Pictures(size, seen, [""] * len(seen), []), board), truth
 
 
-def table(n: int) -> list[Row]:
-    return [*hand_eye_rows(n), *other_rows(n)]
+def table(n: int) -> Iterator[Row]:
+    yield from hand_eye_rows(n)
+    yield from other_rows(n)
+
+
+def acceptance(n: int) -> dict[str, float]:
+    """What the tests of acceptance do with n good hand-eye sets of 24 views, and with as many bad ones."""
+    noise, found = hand_eye.RobotNoise(), []
+    for seed in range(n):
+        rng = np.random.default_rng([seed, 11])
+        data, Z, _ = synthetic.views(rng, 24, 0.52, noise, PIXEL)
+        seen = rng.uniform(-0.3, 0.3, (5, 3)) + [0, 0, 1.3]
+        tip = seen @ Z[:3, :3].T + Z[:3, 3] + 1e-3 / np.sqrt(3) * rng.normal(size=(5, 3))
+        good, solution = hand_eye.calibrate(data, noise)
+        error = 1e3 * float(np.linalg.norm(solution.T_base_cam[:3, 3] - Z[:3, 3]))
+        touch = Touch(tip, seen, 1e-3 / np.sqrt(3))
+        slipped = replace(data, flange=data.flange.copy())
+        slipped.flange[12:, :3, 3] += [0, 0, 3e-3]
+        found.append(
+            {
+                "chi2 / dof of good data, mean": solution.chi2_dof,
+                "hold-out chi2 / dof of good data, mean": float(good.quality["holdout_chi2_dof"]),
+                "good data refused": float(bool(good.reasons)),
+                "jack-knife squared": float(good.quality["jack_knife_mm"]) ** 2,
+                "error squared": error**2,
+                "good data refused by the touch check": float(bool(_touched(touch, solution))),
+                "camera 10 mm off refused by the touch check": float(bool(_touched(touch, _moved(solution)))),
+                "robot 3 mm off in half of the views refused": float(
+                    bool(hand_eye.calibrate(slipped, noise)[0].reasons)
+                ),
+            }
+        )
+    mean = {key: float(np.mean([trial[key] for trial in found])) for key in found[0]}
+    mean["jack-knife sigma / true error, rms"] = float(
+        np.sqrt(mean.pop("jack-knife squared") / mean.pop("error squared"))
+    )
+    return mean
+
+
+def _touched(touch: Touch, solution: hand_eye.Solution) -> list[str]:
+    return touch.compare(solution.T_base_cam, solution.covariance[:6, :6])[1]
+
+
+def _moved(solution: hand_eye.Solution) -> hand_eye.Solution:
+    return replace(solution, T_base_cam=perturb(solution.T_base_cam, np.array([0.01, 0, 0, 0, 0, 0])))
 
 
 def main() -> None:
@@ -146,6 +211,9 @@ def main() -> None:
     for r in table(n):
         ratio = "states none" if np.isnan(r.ratio) else f"{r.ratio:.2f}"
         print(f"| {r.method} | {r.condition} | {r.bias:.3g} | {r.spread:.3g} | {r.unit} | {ratio} |", flush=True)
+    print(f"\n| acceptance of hand-eye, n = {n} | |\n|---|---|")
+    for name, value in acceptance(n).items():
+        print(f"| {name} | {value:.3g} |")
 
 
 if __name__ == "__main__":

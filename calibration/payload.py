@@ -70,6 +70,27 @@ def regressor(robot: RobotParams, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return Y, bare
 
 
+def flange_poses(robot: RobotParams, q: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) T_base_flange of (n, dof) rad."""
+    model = load(robot, ToolParams("none", 0.0, (0.0,) * 3, (0.0,) * 6, ())).pin_model
+    data, frame = model.createData(), model.getFrameId(robot.flange, pin.BODY)
+    T = np.zeros((len(q), 4, 4))
+    for i, angles in enumerate(q):
+        pin.framesForwardKinematics(model, data, angles)
+        T[i] = data.oMf[frame].homogeneous
+    return T
+
+
+def unexplained(
+    robot: RobotParams, q: np.ndarray, tau: np.ndarray, empty: np.ndarray | None, load: Result
+) -> np.ndarray:
+    """(n, dof) Nm that neither the payload of the result nor its biases explain."""
+    Y, bare = regressor(robot, q)
+    mass, *com = load.value
+    said = Y @ np.array([mass, *(mass * np.array(com))]) + np.array(load.quality["bias"])
+    return np.asarray(tau - (bare if empty is None else empty) - said)
+
+
 def _reasons(mass: float, com: np.ndarray, sigma: np.ndarray, condition: float) -> list[str]:
     reasons = []
     if condition > MOST_CONDITION:

@@ -130,6 +130,12 @@ class Result:
         C = np.array(self.covariance)
         return float(k * (_largest(C[:3, :3]) + distance * _largest(C[3:, 3:])))
 
+    def capsule_bounds(self, p0: np.ndarray, p1: np.ndarray, radius: np.ndarray, k: float = 3.0) -> np.ndarray:
+        """(m,) m, k-sigma bound on the surface of capsules seen at p0, p1 (m, 3) in the parent's frame."""
+        camera = np.array(self.value[:3])
+        reach = radius + np.maximum(np.linalg.norm(p0 - camera, axis=1), np.linalg.norm(p1 - camera, axis=1))
+        return np.array([self.position_bound(float(distance), k) for distance in reach])
+
 
 def _largest(covariance: np.ndarray) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from asc_rt.core.params import RobotParams
@@ -44,6 +46,14 @@ def views(
     said = poses(rng, Z @ B @ inverse(X), noise)
     seen = perturb(B, rng.multivariate_normal(np.zeros(6), pixel, n))
     return Views(said, seen, np.tile(pixel, (n, 1, 1)), np.zeros((n, 6, 0))), Z, X
+
+
+def shared_errors(rng: np.random.Generator, views: Views) -> Views:
+    """The same views through a lens and off a print that are wrong by what is stated: 0.1 % in focal length, 0.05 %."""
+    lens = np.zeros((len(views), 6, 2))
+    lens[:, 2, 0] = 1e-3 * views.board[:, 2, 3]
+    lens[:, :3, 1] = 5e-4 * views.board[:, :3, 3]
+    return replace(views, board=perturb(views.board, lens @ rng.normal(size=2)), lens=lens)
 
 
 def touches(rng: np.random.Generator, n: int, tilt: float, sigma: float) -> tuple[np.ndarray, np.ndarray]:

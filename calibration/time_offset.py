@@ -57,6 +57,18 @@ def calibrate(
     )  # fmt: skip
 
 
+def fits(
+    t_cam: np.ndarray, p_cam: np.ndarray, t_robot: np.ndarray, p_robot: np.ndarray, span: float, best: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Trial offsets (s), the rms (m) that each leaves, and (n, 3) m what `best` leaves."""
+    inside = (t_cam > t_robot[0] + span) & (t_cam < t_robot[-1] - span)
+    t, p, path = t_cam[inside], p_cam[inside], CubicSpline(t_robot, p_robot)
+    offsets = np.arange(-span, span + GRID / 2, GRID)
+    costs = np.array([_rigid(path(t + o), p)[2] for o in offsets])
+    R, s, _ = _rigid(path(t + best), p)
+    return offsets, np.sqrt(costs / len(t)), p - path(t + best) @ R.T - s
+
+
 def _check(t_cam: np.ndarray, p_cam: np.ndarray, t_robot: np.ndarray, p_robot: np.ndarray) -> None:
     lines = []
     for name, t, p in (("camera", t_cam, p_cam), ("robot", t_robot, p_robot)):

@@ -7,7 +7,7 @@ unknowns. The residual stays small for good and for bad sets alike; what tells t
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calibration.result import CalibrationError, Result, rows
 
@@ -38,7 +38,7 @@ def calibrate(flange: np.ndarray, sigma: float = 0.5e-3) -> Result:
         reasons.append(
             f"condition {condition:.3g} is above {MOST_CONDITION:g}: turn the flange farther, about two axes"
         )
-    if chi2_dof > chi2.ppf(1 - CHI2_TAIL, dof) / dof:
+    if chi2_dof > chdtri(dof, CHI2_TAIL) / dof:
         reasons.append(
             f"chi2_dof {chi2_dof:.3g}: the tip did not stay on one point within {1e3 * sigma:g} mm; "
             "look for slipped touches or millimetres taken for metres"

@@ -7,6 +7,7 @@ any error. Nobody but this module sees OpenCV's shapes, and `residual` refuses w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from calibration.geometry import exp, log, perturb, pose
 
 DICTIONARY = cv2.aruco.DICT_5X5_250
+SMOOTHING = 1.0  # px, against noise before slopes are measured
 MARKER_SHARE = 0.75  # of a square's side
 
 
@@ -76,9 +78,37 @@ def detect(image: np.ndarray, board: Board) -> Detection:
     return Detection(np.asarray(ids).reshape(-1), points2(corners), markers)
 
 
-def sharpness(image: np.ndarray) -> float:
-    """Variance of the Laplacian: falls with blur."""
-    return float(cv2.Laplacian(image, cv2.CV_64F).var())
+def read(path: Path) -> np.ndarray | None:
+    """(height, width) grey, 8 bits; None: no picture."""
+    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"0", np.uint8), cv2.IMREAD_GRAYSCALE)
+    return None if image is None else np.asarray(image)
+
+
+def read_depth(path: Path) -> np.ndarray | None:
+    """(height, width) 16 bits as they stand in the file; None: no picture of 16 bits and one channel."""
+    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"0", np.uint8), cv2.IMREAD_UNCHANGED)
+    return np.asarray(image) if image is not None and image.dtype == np.uint16 and image.ndim == 2 else None
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    ok, data = cv2.imencode(path.suffix, image)
+    if not ok:
+        raise ValueError(f"{path.suffix}: no format for pictures")
+    path.write_bytes(data.tobytes())
+
+
+def blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Out of focus by `sigma` px."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma))
+
+
+def edge_width(image: np.ndarray) -> float:
+    """px: sigma of the blur of the sharpest edges, from contrast / (sqrt(2 pi) slope); noise hardly matters."""
+    smooth = cv2.GaussianBlur(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), SMOOTHING)
+    slope = np.hypot(*(cv2.Sobel(smooth, cv2.CV_64F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))))
+    low, high = np.quantile(smooth, (0.005, 0.995))
+    width = float((high - low) / (np.sqrt(2 * np.pi) * max(np.quantile(slope, 0.999), 1e-9)))
+    return float(np.sqrt(max(width**2 - SMOOTHING**2, 0.0)))
 
 
 def project(points: np.ndarray, T: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:

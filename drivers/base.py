@@ -8,7 +8,7 @@ Recovery is policy (`asc_rt.core.mode`) plus a person.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
@@ -40,6 +40,7 @@ class DriverCaps:
     period_ns: int  # nominal
     identity: str  # model, protocol, version as the device tells them
     limits: JointLimits | None = None  # None: it tells none; the profile's are all there is
+    tells_tool: bool = False  # True: JointState.tool_id is the tool changer's word
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +90,42 @@ WireTap = Callable[[str, int, bytes], None]  # (direction "rx" or "tx", t_ns, ra
 
 @runtime_checkable
 class ReplayCodec(Protocol):
-    """A driver's codec without its link, to check a recording. Optional: a driver that has these two methods."""
+    """A driver's codec without its link, to check a recording. Optional: a driver that has these two methods.
+
+    `resolution`, if it has that too: how far a position may be rounded by the wire, rad.
+    """
 
     def decode_sample(self, data: bytes) -> tuple[int, Vector, Vector] | None:
         """(sequence, q, current) of a received packet, as `read` tells them; None: a packet of another kind."""
 
-    def encode_set_point(self, seq: int, q: Vector, last: bool) -> bytes:
+    def encode_command(self, seq: int, command: JointCommand) -> bytes:
         """The packet that `write` sends for it."""
+
+
+Dynamics = Callable[[Vector, Vector, Vector], Vector]  # (q, dq, ddq) -> the torque that this motion needs, Nm
+
+
+@runtime_checkable
+class Weighted(Protocol):
+    """A driver that has to carry the arm while the core is silent: enabling, stopping, leaving. Optional."""
+
+    dynamics: Dynamics  # set before activate()
+
+
+@runtime_checkable
+class Exportable(Protocol):
+    """A driver whose recorded packets other tools can read in a format of their own. Optional."""
+
+    def export(self, packets: Iterable[tuple[str, int, bytes]], path: str) -> int:
+        """Write (direction, t_ns, bytes), in the order of time, to `path`; how many frames. ValueError: the format."""
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A driver that has something to tell of a session. Optional."""
+
+    def report(self) -> dict[str, Any]:
+        """Counts and verdicts, JSON-able; told with the end of the session."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from logs.audit_evidence import Evidence, Progress, gather
+from logs.audit_evidence import Evidence, gather
 from logs.audit_finding import Finding
 from logs.audit_rules import RULES
 from logs.mcap_scan import CorruptLog
-from logs.recording import Recording, open_recording
+from logs.reader import Progress
+from logs.recording import Recording
 from logs.replay import replay
 
 CHANGES = 400  # changes of mode whose neighbourhood is run again
@@ -34,21 +35,25 @@ def audit(
     *,
     sample: int | None = SAMPLE,
     jobs: int = 1,
+    reading: Progress = iter,
     progress: Progress = iter,
 ) -> tuple[dict[str, Any], Evidence | None]:
     """The report, and what it was made of (None: the file is damaged). `sample`: cycles to run again; None: all.
+    `reading` goes over the megabytes of the file, `progress` over the cycles that are run again.
 
     LogError: not a recording at all, or not readable.
     """
     try:
-        log = open_recording(path)
+        evidence = gather(path, reading)
     except CorruptLog as error:
         return _damaged(path, error), None
-    evidence = gather(log, progress)
+    log = evidence.log
     evidence.trusted, evidence.trusted_name = trusted, trusted_name
     if log.cycles:
         cycles = chosen(evidence, sample)
-        evidence.replay = replay(log, cycles=cycles, columns=evidence.c, jobs=jobs, progress=progress)
+        evidence.replay = replay(
+            log, cycles=cycles, columns=evidence.c, packets=evidence.packets, jobs=jobs, progress=progress
+        )
     findings = [rule(evidence) for rule in RULES]
     return _report(log, evidence, findings), evidence
 
@@ -89,6 +94,7 @@ def _report(log: Recording, e: Evidence, findings: list[Finding]) -> dict[str, A
         "min_distance_m": _least(distance),
         "worst_phi": named["safety rows"].worst,
         "stops": e.notes.get("stops", []),
+        "swaps": e.notes.get("swaps", []),
         "certificate": named["certificate"].detail,
         "session": {key: value for key, value in log.session.items() if not key.startswith("sha256 ")},
         "attachments": {name: hashlib.sha256(data).hexdigest() for name, data in log.attachments.items()},

@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from asc_rt.core.types import Mode
-from logs.reader import Records
-from logs.recording import Recording
+from asc_rt.record import RecordLayout
+from logs import schema
+from logs.reader import Log, Progress, Records
+from logs.recording import Recording, open_recording
 from logs.replay import ReplayReport
 from logs.summary import STOP_COLUMNS
 from logs.wire import FIELDS as WIRE_FIELDS
+from logs.wire import Packets
 
 Column = np.ndarray[Any, Any]
-Progress = Callable[[Iterable[int]], Iterable[int]]
 
+BLOCK = 500  # cycles that are made columns at once
+_WIRES = {schema.WIRE_RX.topic: "rx", schema.WIRE_TX.topic: "tx"}
 MOVING = (Mode.ACTIVE, Mode.STOPPING)
+SENSOR_COLUMNS = (
+    "id", "seq", "age_ns", "sigma_ns", "fault", "health", "says_nothing", "coverage", "calibration_hash",
+)  # fmt: skip
 _COLUMNS = tuple({  # each once
-    *WIRE_FIELDS, *STOP_COLUMNS, "state.tick", "state.q_cmd", "state.dq_cmd", "state.ddq_cmd",
+    *WIRE_FIELDS, *STOP_COLUMNS, "state.tick", "state.tool", "state.q_cmd", "state.dq_cmd", "state.ddq_cmd",
     "inputs.period_ns", "inputs.missed_ticks", "inputs.late", "inputs.events.count", "inputs.events.kind",
-    "inputs.human.present", "inputs.human.health", "inputs.human_age_ns", "inputs.human_fault",
+    "inputs.human.present", "inputs.human_age_ns", "inputs.sensors.count",
+    *(f"inputs.sensors.{name}" for name in SENSOR_COLUMNS),
     "inputs.joint.present", "inputs.joint.q", "inputs.joint.dq", "inputs.joint.tool_id", "inputs.joint.t_rx_ns",
     "outputs.decision.status", "outputs.decision.share", "outputs.decision.d_measured",
     "outputs.command.kind", "outputs.command.q", "outputs.command.tau",
-    "receipt.present", "receipt.ok", "receipt.seq", "receipt.t_tx_ns",
+    "outputs.command.present", "receipt.present", "receipt.ok", "receipt.seq", "receipt.t_tx_ns",
     "timings.t_wake_ns", "timings.t_write_end_ns",
 })  # fmt: skip
 
@@ -39,6 +47,7 @@ class Evidence:
     log: Recording
     c: dict[str, Column]
     broken_records: int  # whose own checksum is wrong
+    packets: Packets  # by their time
     trusted: Ed25519PublicKey | None = None  # whose recordings the auditor trusts
     trusted_name: str = ""
     replay: ReplayReport | None = None
@@ -76,21 +85,41 @@ class Evidence:
         return found
 
 
-def gather(log: Recording, progress: Progress = iter) -> Evidence:
-    """LogError: the file."""
-    parts: list[dict[str, Column]] = []
-    broken, size = 0, log.layout.size
-    batches = log.batches()
-    for _ in progress(range(log.chunks_with_cycles)):
-        batch = next(batches)
-        raw = batch.tobytes()
-        broken += sum(log.layout.syndrome(raw[k : k + size]) != 0 for k in range(0, len(raw), size))
-        parts.append({path: batch[path].copy() for path in _COLUMNS} | _derived(batch))
-    if not parts:
-        parts.append({path: np.zeros(0, log.layout.dtype[path]) for path in _COLUMNS})
-        parts[0] |= _derived(np.zeros(0, log.layout.dtype))
-    columns = {path: np.concatenate([part[path] for part in parts]) for path in parts[0]}
-    return Evidence(log, columns, broken)
+def gather(path: str | Path, progress: Progress = iter) -> Evidence:
+    """Open the recording and take all that is needed in the same pass. LogError: the file."""
+    harvest = _Harvest()
+    log = open_recording(path, harvest, progress)
+    harvest.condense(log.layout)  # the rest
+    columns = {name: np.concatenate([part[name] for part in harvest.parts]) for name in harvest.parts[0]}
+    return Evidence(log, columns, harvest.broken, (harvest.packets["rx"], harvest.packets["tx"]))
+
+
+class _Harvest:
+    """A `Visitor` that keeps columns of the cycles, and the packets."""
+
+    def __init__(self) -> None:
+        self.parts: list[dict[str, Column]] = []
+        self.packets: dict[str, dict[int, bytes]] = {"rx": {}, "tx": {}}
+        self.broken = 0  # records whose own checksum is wrong
+        self._waiting: list[bytes] = []
+
+    def __call__(self, log: Log, topic: str, messages: list[bytes]) -> None:
+        if topic == schema.CYCLE.topic:
+            self.broken += sum(log.layout.syndrome(record) != 0 for record in messages)
+            self._waiting += messages
+            if len(self._waiting) >= BLOCK:
+                self.condense(log.layout)
+        elif topic in _WIRES:
+            kept = self.packets[_WIRES[topic]]
+            for message in messages:
+                t_ns, _, data = schema.parse_wire_message(message)
+                kept[t_ns] = data
+
+    def condense(self, layout: RecordLayout) -> None:
+        """Keep the columns of the records that wait."""
+        block = np.frombuffer(b"".join(self._waiting), layout.dtype)
+        self._waiting = []
+        self.parts.append({path: block[path].copy() for path in _COLUMNS} | _derived(block))
 
 
 def _derived(batch: Records) -> dict[str, Column]:

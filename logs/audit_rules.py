@@ -11,16 +11,18 @@ import math
 
 import numpy as np
 
+from asc_rt.core import changer
 from asc_rt.core.rows import nearest_measured
 from asc_rt.core.system import System
-from asc_rt.core.types import CommandKind, EventKind, Health, Mode, Status, StopReason, vector
+from asc_rt.core.types import CommandKind, EventKind, Health, MessageFault, Mode, Status, StopReason, vector
 from asc_rt.synthesis.certificate import CertificateError, covers, parse
-from logs import audit_wire, schema
-from logs.audit_evidence import Column, Evidence
+from logs import audit_wire, latency, schema
+from logs.audit_evidence import SENSOR_COLUMNS, Column, Evidence
 from logs.audit_files import closed, completeness, identity, records, seals, signature
 from logs.audit_finding import Finding, Rule, skip
+from logs.audit_tools import tool
 from logs.summary import APPROACH_M_S, stops
-from logs.wire import driver_of, packets
+from logs.wire import driver_of
 
 ROUNDING = 1e-5  # share of a limit that rounding may take: the gate allows as much
 REST_STEP = 1e-9  # rad in one cycle: a set-point that stands still
@@ -55,22 +57,50 @@ def timing(e: Evidence) -> Finding:
 
 
 def human_age(e: Evidence) -> Finding:
-    """In every cycle that works towards a goal the person's state is there, healthy and young enough."""
+    """In every cycle that works towards a goal every sensor of the cell is heard, in time, healthy and its own."""
     active = e.mode_after == Mode.ACTIVE
     if not active.any():
         return skip("human age", "the arm was never active")
-    age, limit = e.c["inputs.human_age_ns"], e.log.params.human.age_limit_ns
-    there = (e.c["inputs.human.present"] == 1) & (e.c["inputs.human_fault"] == 0)
-    healthy = e.c["inputs.human.health"] != Health.FAULT
-    good = there & healthy & (age <= limit) & (age >= -e.log.params.human.future_limit_ns)
-    bad = active & ~good
+    p = e.log.params.human
+    sensors = {name: e.c[f"inputs.sensors.{name}"] for name in SENSOR_COLUMNS}
+    listed = np.arange(sensors["id"].shape[1]) < e.c["inputs.sensors.count"][:, None]
+    age, oldest = sensors["age_ns"], sensors["age_ns"] + sensors["sigma_ns"]
+    good = (
+        listed & (sensors["fault"] == MessageFault.NONE) & (sensors["seq"] > 0) & (sensors["health"] != Health.FAULT)
+        & (oldest <= p.age_limit_ns) & (age >= -p.future_limit_ns - sensors["sigma_ns"])
+        & (sensors["sigma_ns"] <= p.clock_limit_ns) & (sensors["coverage"] >= p.least_coverage)
+        & (sensors["says_nothing"] == 0)
+    )  # fmt: skip
+    usable = e.c["inputs.human.present"] == 1
+    for sensor in p.sensors:
+        own = (sensors["id"] == sensor.id) & (sensors["calibration_hash"] == sensor.calibration_hash)
+        usable &= (good & own).any(axis=1)
+    bad = active & ~usable
     if len(bad):
         bad[-1] = False  # what the last cycle led to is not in the record
-    worst = int(np.where(active, age, np.iinfo(np.int64).min).argmax())
-    detail = "present, healthy and in time in every active cycle"
+    eldest = np.where(listed, oldest, 0).max(axis=1)
+    worst = int(np.where(active, eldest, np.iinfo(np.int64).min).argmax())
+    detail = "every sensor heard, healthy and in time in every active cycle"
     if bad.any():
-        detail = f"{int(bad.sum())} active cycles without a usable person, first at {e.at(int(bad.argmax()))}"
-    return Finding("human age", not bad.any(), detail, False, age[worst] * 1e-6, limit * 1e-6, "ms", e.at(worst))
+        detail = f"{int(bad.sum())} active cycles without a usable sensor, first at {e.at(int(bad.argmax()))}"
+    limit_ms = p.age_limit_ns * 1e-6
+    return Finding("human age", not bad.any(), detail, False, eldest[worst] * 1e-6, limit_ms, "ms", e.at(worst))
+
+
+def reaction(e: Evidence) -> Finding:
+    """No set-point of an active cycle rests on people seen longer ago than the age limit and one period."""
+    active = {name: e.c[name][e.mode_after == Mode.ACTIVE] for name in latency.COLUMNS}
+    delay = latency.photon_to_command_ns(active)
+    if not len(delay):
+        return skip("reaction", "no active cycle knew of people")
+    limit_ns = e.log.params.human.age_limit_ns + e.log.params.period_ns
+    late = int((delay > limit_ns).sum())
+    told = latency.statistics(delay)
+    e.notes["photon_to_command_ms"] = told
+    detail = f"photon to command p50 {told['p50']:.1f}, p99 {told['p99']:.1f}, largest {told['max']:.1f} ms"
+    if late:
+        detail += f"; {late} cycles over the age limit and one period"
+    return Finding("reaction", not late, detail, False, told["max"], limit_ns * 1e-6, "ms")
 
 
 # --- limits ----------------------------------------------------------------------------------------------------------
@@ -156,10 +186,11 @@ def separation(e: Evidence) -> Finding:
 
 def approach(e: Evidence, cycles: Column) -> Column:
     """How fast the arm itself, if people stood still, would come nearer to them in these cycles, m/s."""
-    system, h = System(e.log.params), 1e-3
+    every, h = System(e.log.params), 1e-3
     found = np.zeros(len(cycles))
     for k, i in enumerate(cycles):
-        _, x, _ = e.log.layout.unpack(e.log.record(int(i)))
+        before, x, _ = e.log.layout.unpack(e.log.record(int(i)))
+        system = every.holding(changer.told(e.log.params, before, x))
         if x.joint is not None:
             ahead = dataclasses.replace(x, joint=dataclasses.replace(x.joint, q=vector(x.joint.q + h * x.joint.dq)))
             found[k] = (nearest_measured(system, x) - nearest_measured(system, ahead)) / h
@@ -194,7 +225,7 @@ def stop_times(e: Evidence) -> Finding:
     for stop in found:
         i = int(np.searchsorted(ticks, stop["cycle"]))
         end = min(int(np.searchsorted(e.t_s, stop["t_s"] + stop["braking_s"])) + 1, e.cycles - 1)
-        allowed = _braking_time(e, i) + STOP_SLACK_S
+        allowed = braking_time(e, i) + STOP_SLACK_S
         stop["travel_rad"] = round(float(np.abs(q[end] - q[i]).max()), 6)
         stop["allowed_s"] = round(allowed, 6)
         cut = StopReason[stop["final_reason"]] >= StopReason.ROBOT_NOT_READY  # the robot stops by its own rule
@@ -211,7 +242,7 @@ def stop_times(e: Evidence) -> Finding:
     return Finding("stops", True, detail, False, longest, None, "s")
 
 
-def _braking_time(e: Evidence, i: int) -> float:
+def braking_time(e: Evidence, i: int) -> float:
     """How long the slowest joint needs to rest from the set-point of cycle i, s: the acceleration to zero first, which
     adds a^2 / 2J to the speed, then an S-curve with or without a plateau."""
     robot, a = e.log.params.robot, np.abs(e.c["state.ddq_cmd"][i])
@@ -253,32 +284,46 @@ def wire_bytes(e: Evidence) -> Finding:
     decode = audit_wire.DECODERS.get(driver_of(e.log))
     if decode is None:
         return skip(name, "there is no independent decoder for this driver")
-    _, sent = packets(e.log)
+    _, sent = e.packets
     if not sent:
         return skip(name, "no packets were recorded")
     claims = np.flatnonzero((e.c["receipt.present"] == 1) & (e.c["receipt.ok"] == 1))
-    worst, at = 0.0, 0
-    for i in claims:
-        told = decode(sent.get(int(e.c["receipt.t_tx_ns"][i]), b""))
-        same = told is not None and told.seq == e.c["receipt.seq"][i]
-        off = float(np.abs(told.q - e.c["outputs.command.q"][i]).max()) if told is not None and same else math.inf
-        if not off <= worst:
-            worst, at = off, int(i)
-        if not off <= audit_wire.ROUNDING:
-            return Finding(name, False, f"{e.at(int(i))}: the packet says something else", moment=e.at(int(i)))
-    detail = f"{len(claims)} set-points decode to the recorded commands, {worst:.1e} rad off at most"
-    return Finding(name, True, detail, False, worst, audit_wire.ROUNDING, "rad", e.at(at) if len(claims) else "")
+    if not len(claims):
+        return skip(name, "nothing was sent")
+    nothing = audit_wire.SetPoint(-1, False, (math.inf,) * e.log.params.n)
+    told = [decode(sent.get(t_ns, b"")) or nothing for t_ns in e.c["receipt.t_tx_ns"][claims].tolist()]
+    off = np.abs(np.array([point.q for point in told]) - e.c["outputs.command.q"][claims]).max(axis=1)
+    off[np.array([point.seq for point in told]) != e.c["receipt.seq"][claims]] = math.inf
+    if (bad := ~(off <= audit_wire.ROUNDING)).any():
+        at = e.at(int(claims[bad.argmax()]))
+        return Finding(name, False, f"{at}: the packet says something else", moment=at)
+    worst = int(off.argmax())
+    detail = f"{len(claims)} set-points decode to the recorded commands, {off[worst]:.1e} rad off at most"
+    return Finding(name, True, detail, False, float(off[worst]), audit_wire.ROUNDING, "rad", e.at(int(claims[worst])))
 
 
 def certificate(e: Evidence) -> Finding:
-    """A certificate was there and covered what was decided with: arm, its limits of the day, tool, index, ranges."""
-    name, p = "certificate", e.log.params
+    """A certificate was there and covered what was decided with, for every tool that the arm moved with."""
+    used = np.unique(e.c["state.tool"][e.moving])
+    findings = [_certified(e, int(mount)) for mount in (used if len(used) else [0])]
+    wrong = [found for found in findings if not found.holds]
+    return (wrong or findings)[0] if len(findings) == 1 or wrong else _all_of(findings)
+
+
+def _all_of(findings: list[Finding]) -> Finding:
+    return dataclasses.replace(findings[0], detail="; ".join(found.detail for found in findings))
+
+
+def _certified(e: Evidence, mount: int) -> Finding:
+    """Of one tool: arm, its limits of the day, tool, index, ranges."""
+    name, p = "certificate", e.log.params.holding(mount)
     simulated = e.log.session.get("simulated") == "true"
-    if schema.CERTIFICATE not in e.log.attachments:
+    file = f"{schema.CERTIFICATE}-{p.tool.name}" if mount else schema.CERTIFICATE
+    if file not in e.log.attachments:
         missing = f"none for tool {p.tool.name} on {p.robot.name}"
         return skip(name, f"{missing}, in simulation") if simulated else Finding(name, False, missing)
     try:
-        found = parse(e.log.attachments[schema.CERTIFICATE], schema.CERTIFICATE)
+        found = parse(e.log.attachments[file], file)
     except CertificateError as error:
         return Finding(name, False, str(error))
     if reasons := covers(found, p):
@@ -313,6 +358,7 @@ def wire(e: Evidence) -> Finding:
 
 
 RULES: tuple[Rule, ...] = (
-    identity, seals, signature, closed, records, completeness, timing, human_age, position, speed, acceleration, jerk,
-    torque, separation, safety_rows, stop_times, no_motion, armed, wire_bytes, wire, certificate, replayed,
+    identity, seals, signature, closed, records, completeness, timing, human_age, reaction, position, speed,
+    acceleration, jerk, torque, tool, separation, safety_rows, stop_times, no_motion, armed, wire_bytes, wire,
+    certificate, replayed,
 )  # fmt: skip

@@ -6,11 +6,10 @@ driver's is one function and one line in `DECODERS`.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from typing import NamedTuple
-
-import numpy as np
 
 ROUNDING = 1e-6  # rad: float32 degrees are up to 2.7e-7 rad off
 _AXES = {1: (28, ">9f", 64), 5: (32, ">9d", 104)}  # type -> offset, format, size of the packet
@@ -20,7 +19,7 @@ _JOINT_STYLE = 1
 class SetPoint(NamedTuple):
     seq: int
     last: bool
-    q: np.ndarray[tuple[int], np.dtype[np.float64]]  # rad, URDF
+    q: tuple[float, ...]  # rad, URDF
 
 
 def stream_motion(data: bytes) -> SetPoint | None:
@@ -56,7 +55,7 @@ def stream_motion_b(data: bytes) -> SetPoint | None:
 
 
 def _set_point(seq: int, last: int, axes: tuple[float, ...] | list[float]) -> SetPoint:
-    return SetPoint(seq, bool(last), np.array([axis * np.pi / 180.0 for axis in axes[:6]]))
+    return SetPoint(seq, bool(last), tuple(map(math.radians, axes[:6])))
 
 
 DECODERS: dict[str, Callable[[bytes], SetPoint | None]] = {

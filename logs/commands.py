@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
+
+from logs.progress import progress
 
 Show = Callable[[dict[str, Any], bool], None]
 Refuse = Callable[[str], NoReturn]
@@ -50,7 +51,7 @@ def _register_replay(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: C
         order = Order.REVERSE if reverse else Order.FORWARD
         try:
             report = replay_log(
-                log, start, order, stepper=core_stepper, jobs=jobs or os.cpu_count() or 1, progress=_bar()
+                log, start, order, stepper=core_stepper, jobs=jobs or os.cpu_count() or 1, progress=progress("cycles")
             )
         except IndexError as error:
             refuse(f"--from: {error}")
@@ -105,10 +106,16 @@ def _register_audit(app: typer.Typer, show: Show, refuse: Refuse, limit_blas: Ca
         except KeyFileError as error:
             refuse(f"{error}; {error.hint}")
         report, evidence = audit_log(
-            log, trusted, name, sample=sample or None, jobs=jobs or os.cpu_count() or 1, progress=_bar()
+            log,
+            trusted,
+            name,
+            sample=sample or None,
+            jobs=jobs or os.cpu_count() or 1,
+            reading=progress("MB"),
+            progress=progress("cycles"),
         )
         if page is not None:
-            _write_page(log, page, report, evidence, pictures)
+            _write_page(page, report, evidence, pictures)
         if as_json:
             show(report, True)
         else:
@@ -127,30 +134,25 @@ def _trusted(path: Path | None) -> tuple[Any, str]:
     return load_public_key(path or own), f"the key {path}" if path else "this machine's own key"
 
 
-def _write_page(log: Path, page: Path, report: dict[str, Any], evidence: Any, pictures: bool) -> None:
+def _write_page(page: Path, report: dict[str, Any], evidence: Any, pictures: bool) -> None:
     from logs.report import html_report, moments
 
     taken: list[Any] = []
     note = ""
     if evidence is not None and pictures:
-        taken, note = _pictures(log, moments(evidence))
+        taken, note = _pictures(evidence.log, moments(evidence))
     page.write_text(html_report(report, evidence, taken, note), encoding="utf-8")
 
 
-def _pictures(log: Path, wanted: list[Any]) -> tuple[list[Any], str]:
+def _pictures(log: Any, wanted: list[Any]) -> tuple[list[Any], str]:
     """A picture of each moment, and why there are no more."""
-    import tempfile
-
     from logs.report import Picture
-    from logs.view import ViewError, view
+    from logs.view import ViewError, picture
 
     taken: list[Any] = []
     try:
-        with tempfile.TemporaryDirectory(prefix="asc-audit-") as folder:
-            for number, moment in enumerate(wanted):
-                file = Path(folder, f"{number}.png")
-                view(log, shot=file, at=moment.t_s)
-                taken.append(Picture(moment, file.read_bytes()))
+        for moment in progress("pictures")(wanted):
+            taken.append(Picture(moment, picture(log, moment.t_s)))
     except ViewError as error:
         return taken, str(error)
     return taken, ""
@@ -176,7 +178,7 @@ def _what_if(path: Path, overrides: list[str], as_json: bool, show: Show) -> Non
 
     log = open_recording(path)
     params = changed(log.params, overrides) if overrides else log.params
-    found = what_if(log, core_stepper(params), params, progress=_bar())
+    found = what_if(log, core_stepper(params), params, progress=progress("cycles"))
     first = found.first
     result = {
         "cycles": found.cycles,
@@ -209,9 +211,3 @@ def told(found: dict[str, Any]) -> list[str]:
         largest = "" if change["largest"] is None else f"by up to {change['largest']:.3g} (cycle {change['at']})"
         lines.append(f"{name:36} {change['cycles']:8} cycles {largest}")
     return lines
-
-
-def _bar() -> Any:
-    from tqdm import tqdm
-
-    return partial(tqdm, unit=" cycles", disable=None)

@@ -47,6 +47,10 @@ def _files(cell: Cell) -> dict[str, Path]:
         "tool.toml": TOOLS / f"{cell.params.tool.name}.toml",
         schema.CERTIFICATE: cell.certificates / file_name(cell.params.robot.name, cell.params.tool.name),
     }
+    for mount in cell.params.changer.mounts[1:]:  # the first is the cell's own
+        name = mount.tool.name
+        files[f"tool-{name}.toml"] = TOOLS / f"{name}.toml"
+        files[f"{schema.CERTIFICATE}-{name}"] = cell.certificates / file_name(cell.params.robot.name, name)
     meshes = {str(mesh.get("filename")) for mesh in ET.fromstring(cell.params.robot.urdf).iter("mesh")}
     files |= {f"mesh/{name}": folder / name for name in meshes}
     files |= {key: cell.path.parent / name for key, name in _texts(cell).items()}

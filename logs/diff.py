@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -27,15 +28,21 @@ def differences(layout: RecordLayout, logged: Buffer, replayed: Buffer, parts: t
 
     Bytes decide: -0.0 differs from 0.0, and equal NaNs do not differ.
     """
-    for leaf in layout.leaves:
-        if leaf.path.split(".")[0] not in parts:
-            continue
+    for leaf in itertools.chain.from_iterable(_unequal(layout, name, logged, replayed) for name in parts):
         span = slice(leaf.offset, leaf.offset + leaf.size)
         if logged[span] == replayed[span]:
             continue
         a, b = _values(leaf, logged), _values(leaf, replayed)
         for index in np.argwhere(a.view("V8") != b.view("V8")) if leaf.shape else [()]:
             yield _difference(leaf, tuple(index), a[tuple(index)], b[tuple(index)])
+
+
+def _unequal(layout: RecordLayout, name: str, logged: Buffer, replayed: Buffer) -> Iterable[Leaf]:
+    """The fields of a part; none if all its bytes are equal, as they mostly are."""
+    part = layout.parts.get(name)
+    if part is None:
+        return layout.leaves[-1:]  # the check
+    return () if part.bytes_of(logged) == part.bytes_of(replayed) else part.leaves
 
 
 def altered(layout: RecordLayout, record: Buffer) -> Difference | None:

@@ -7,7 +7,7 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +81,17 @@ class LogFile:
 
     def message(self, channel: schema.Channel, t_ns: int, data: bytes) -> None:
         """Add a message of monotonic time `t_ns`; a channel that is new begins with it."""
+        self.messages(channel, (t_ns,), (data,))
+
+    def messages(self, channel: schema.Channel, times: Sequence[int], contents: Sequence[bytes]) -> None:
+        """Add messages, at least one, each with its monotonic time."""
         topic = channel.topic
         if topic not in self._channels:
             self._channels[topic], self._counts[topic] = self._register(channel), 0
-        time_ns = max(0, t_ns + self._wall_minus_monotonic_ns)
-        self._writer.message(self._channels[topic], self._counts[topic], time_ns, data)
-        self._counts[topic] += 1
+        first, self._counts[topic] = self._counts[topic], self._counts[topic] + len(contents)
+        offset = self._wall_minus_monotonic_ns
+        wall = [max(0, t_ns + offset) for t_ns in times]
+        self._writer.messages(self._channels[topic], first, wall, contents)
 
     def wall_ns(self, t_ns: int) -> int:
         """Wall-clock time of the monotonic time `t_ns`, as the file has it."""

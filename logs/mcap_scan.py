@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import Chunk
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK = 256 << 20  # bytes of one uncompressed chunk; more is damage, not data
@@ -58,7 +57,8 @@ class Op(IntEnum):
 
 
 _OPS = frozenset(map(int, Op))
-MESSAGE = int(Op.MESSAGE)  # comparing with the enum itself takes five times as long
+_SUMMED = 1 << 20  # bytes of many records that go into the checksum at once
+MESSAGE, DATA_END, ATTACHMENT = int(Op.MESSAGE), int(Op.DATA_END), int(Op.ATTACHMENT)  # comparing with an enum is slow
 
 
 class Raw(NamedTuple):
@@ -92,7 +92,7 @@ def frames(data: Bytes, name: str, extent: Extent) -> Iterator[Raw]:
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ForeignFile(f"{name}: not an MCAP file")
-    size, at, crc = len(data), len(MAGIC), zlib.crc32(MAGIC)
+    size, at, crc, summed = len(data), len(MAGIC), zlib.crc32(MAGIC), len(MAGIC)
     ends_closed = size >= 2 * len(MAGIC) and data[size - len(MAGIC) :] == MAGIC
     while True:
         raw = _frame(data, name, at)
@@ -100,14 +100,15 @@ def frames(data: Bytes, name: str, extent: Extent) -> Iterator[Raw]:
             if ends_closed:  # the end is there, so this is damage and not a crash
                 raise CorruptLog(f"{name}: damaged at byte {at}: a record reaches beyond the end of the file")
             return
-        if raw.op == Op.DATA_END:
-            _check_end(data, name, raw, crc, extent, ends_closed)
+        if raw.op == DATA_END:
+            _check_end(data, name, raw, zlib.crc32(data[summed:at], crc), extent, ends_closed)
             return
-        if raw.op == Op.ATTACHMENT:
+        if raw.op == ATTACHMENT:
             _check_attachment(data, name, raw)
         yield raw
-        crc = zlib.crc32(data[at : raw.end], crc)
         at = extent.complete_bytes = extent.data_bytes = raw.end
+        if at - summed > _SUMMED:
+            crc, summed = zlib.crc32(data[summed:at], crc), at
 
 
 def _frame(data: Bytes, name: str, at: int) -> Raw | None:
@@ -153,23 +154,42 @@ def parse(kind: Any, data: Bytes, name: str, raw: Raw) -> Any:
 
 def chunk_data(data: Bytes, name: str, raw: Raw) -> bytes:
     """The content of a chunk, uncompressed and checked."""
-    chunk: Chunk = parse(Chunk, data, name, raw)
     broken = CorruptLog(f"{name}: damaged at byte {raw.start}: the checksum of a chunk is wrong")
-    if chunk.uncompressed_size > MAX_CHUNK or chunk.compression not in ("", "zstd"):
+    try:
+        compression, size, crc, content = _chunk_fields(data[raw.body : raw.end])
+    except struct.error as error:
+        raise CorruptLog(f"{name}: damaged at byte {raw.start}: no Chunk") from error
+    if size > MAX_CHUNK or compression not in (b"", b"zstd"):
         raise broken
-    content = chunk.data
-    if chunk.compression == "zstd":
+    if compression:
         try:
-            if (
-                zstandard.frame_content_size(content) != chunk.uncompressed_size
-            ):  # believed, it could ask for any memory
+            if zstandard.frame_content_size(content) != size:  # believed, it could ask for any memory
                 raise broken
-            content = zstandard.ZstdDecompressor().decompress(content, max_output_size=chunk.uncompressed_size)
+            content = _DECOMPRESSOR.decompress(content, max_output_size=size)
         except zstandard.ZstdError as error:
             raise broken from error
-    if len(content) != chunk.uncompressed_size or zlib.crc32(content) != chunk.uncompressed_crc:
+    if len(content) != size or zlib.crc32(content) != crc:
         raise broken
     return content
+
+
+_DECOMPRESSOR = zstandard.ZstdDecompressor()
+_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of the compression's name
+_LENGTH = struct.Struct("<Q")
+
+
+def _chunk_fields(body: bytes) -> tuple[bytes, int, int, bytes]:
+    """Compression, size and CRC of the content, content as it is. Written out: an hour of recording has 72 000 chunks.
+
+    struct.error: no chunk.
+    """
+    _, _, size, crc, named = _CHUNK.unpack_from(body)
+    at = _CHUNK.size + named
+    (length,) = _LENGTH.unpack_from(body, at)
+    content = body[at + _LENGTH.size :]
+    if length != len(content):
+        raise struct.error(f"{length} bytes promised, {len(content)} there")
+    return body[_CHUNK.size : at], size, crc, content
 
 
 def chunk_records(content: bytes, name: str) -> Iterator[Raw]:

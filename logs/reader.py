@@ -12,13 +12,15 @@ Damage is an error. The file is mapped, never loaded: memory does not grow with 
 from __future__ import annotations
 
 import bisect
+import collections
+import copy
 import functools
 import hashlib
 import itertools
 import json
 import mmap
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +37,12 @@ from logs.seal import Seals
 __all__ = ["CorruptLog", "ForeignFile", "Log", "LogError", "LogMessage", "open_log", "records"]
 
 Records = np.ndarray[Any, np.dtype[np.void]]
+Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm
+Visitor = Callable[["Log", str, list[bytes]], None]
+"""Meets every chunk's messages of each topic while the file is checked: to read an hour twice takes twice as long."""
+
+MEGABYTE = 1 << 20
+_CHUNK, _ATTACHMENT, _METADATA = int(Op.CHUNK), int(Op.ATTACHMENT), int(Op.METADATA)  # comparing with an enum is slow
 
 
 class LogMessage(NamedTuple):
@@ -54,7 +62,7 @@ class _ChunkRef:
 class Log:
     """A recording. Made by `open_log`."""
 
-    def __init__(self, path: Path, data: mmap.mmap) -> None:
+    def __init__(self, path: Path, data: mmap.mmap, visit: Visitor | None = None, progress: Progress = iter) -> None:
         self.path, self.data, self._name = path, data, str(path)
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
@@ -66,13 +74,20 @@ class Log:
         self._chunks: list[_ChunkRef] = []
         self.cycles = 0
         self._content = functools.lru_cache(4)(self._uncached_content)
-        self._scan()
-        self.params = self._load_params()
-        self.layout = RecordLayout(self.params.n)
+        self._cycle_data = functools.lru_cache(4)(self._uncached_cycle_data)
+        self._visit = visit
+        self._scan(progress)
+        self.params = self._load_params(schema.DECIDED if schema.DECIDED in self.attachments else schema.PARAMS)
+        self.layout  # noqa: B018 - a recording without cycles must have one, too
         try:
             self.wall_minus_monotonic_ns = int(self.session["wall_minus_monotonic_ns"])
         except (KeyError, ValueError) as error:
             raise CorruptLog(f"{self._name}: damaged: its session metadata tell no clock") from error
+
+    @functools.cached_property
+    def layout(self) -> RecordLayout:
+        """Of its cycle records. The parameters are written before the first of them."""
+        return RecordLayout(self._load_params(schema.PARAMS).n)
 
     @property
     def truncated(self) -> bool:
@@ -123,6 +138,13 @@ class Log:
             return {path: np.zeros(0, self.layout.dtype[path]) for path in paths}
         return {path: np.concatenate([part[path] for part in parts]) for path in paths}
 
+    def excerpt(self, first: int, stop: int) -> Log:
+        """The same recording as if it held only the chunks with the cycles `first` to `stop` - 1."""
+        found, near = copy.copy(self), [c for c in self._chunks if c.first < stop and c.first + c.cycles >= first]
+        found._chunks = [replace(chunk, first=chunk.first - near[0].first) for chunk in near]
+        found.cycles = sum(chunk.cycles for chunk in near)
+        return found
+
     @property
     def topics(self) -> frozenset[str]:
         return frozenset(self._topics.values())
@@ -140,27 +162,30 @@ class Log:
     def _uncached_content(self, raw: Raw) -> bytes:
         return mcap_scan.chunk_data(self.data, self._name, raw)
 
-    def _cycle_data(self, chunk: _ChunkRef) -> list[bytes]:
-        found = [m.data for m in mcap_scan.messages(self._content(chunk.raw), (self._cycle_channel,))]
-        if any(len(data) != self.layout.size for data in found):
-            raise CorruptLog(f"{self._name}: damaged at byte {chunk.raw.start}: a cycle record of the wrong size")
-        return found
+    def _uncached_cycle_data(self, chunk: _ChunkRef) -> list[bytes]:
+        return [m.data for m in mcap_scan.messages(self._content(chunk.raw), (self._cycle_channel,))]
 
     # --- opening -----------------------------------------------------------------------------------------------------
 
-    def _scan(self) -> None:
-        data, name, sha = self.data, self._name, hashlib.sha256(mcap_scan.MAGIC)
+    def _scan(self, progress: Progress) -> None:
+        data, name, sha, hashed = self.data, self._name, hashlib.sha256(), 0
+        left = iter(progress(range(len(data) // MEGABYTE)))
+        done = 0
         for raw in mcap_scan.frames(data, name, self.extent):
-            sha_before = sha.hexdigest() if raw.op == Op.METADATA else ""
-            sha.update(data[raw.start : raw.end])
-            if raw.op == Op.CHUNK:
+            if raw.op == _CHUNK:
                 self._scan_chunk(raw)
-            elif raw.op == Op.ATTACHMENT:
+            elif raw.op == _ATTACHMENT:
                 attachment = mcap_scan.parse(Attachment, data, name, raw)
                 self.attachments[attachment.name] = attachment.data
-            elif raw.op == Op.METADATA:
+            elif raw.op == _METADATA:
+                sha.update(data[hashed : raw.start])
+                hashed = raw.start
                 metadata = mcap_scan.parse(Metadata, data, name, raw)
-                self._meet_metadata(metadata, raw.start, sha_before)
+                self._meet_metadata(metadata, raw.start, sha.hexdigest())
+            while done < raw.end // MEGABYTE:
+                done += 1
+                next(left, None)
+        collections.deque(left, 0)  # so that a bar ends full
         self.seals.finish(self.extent.closed, bool(self.recovered))
         if self._cycle_channel < 0 and (self.extent.closed or self._chunks):
             raise ForeignFile(f"{name}: an MCAP file, but no recording of a cell (no {schema.CYCLE.topic})")
@@ -178,19 +203,24 @@ class Log:
 
     def _scan_chunk(self, chunk: Raw) -> None:
         content = self._content(chunk)
-        cycles, channels = 0, set()
+        found: dict[int, list[bytes]] = {}
         for raw in mcap_scan.chunk_records(content, self._name):
             if raw.op == mcap_scan.MESSAGE:
-                channel = mcap_scan.message_channel(content, raw)
-                channels.add(channel)
-                cycles += channel == self._cycle_channel
+                message = mcap_scan.message(content, raw)
+                found.setdefault(message.channel, []).append(message.data)
             elif raw.op == Op.SCHEMA:
-                found = mcap_scan.parse(Schema, content, self._name, raw)
-                self._schemas[found.id] = found
+                told = mcap_scan.parse(Schema, content, self._name, raw)
+                self._schemas[told.id] = told
             elif raw.op == Op.CHANNEL:
                 self._meet(mcap_scan.parse(Channel, content, self._name, raw))
-        self._chunks.append(_ChunkRef(chunk, self.cycles, cycles, frozenset(channels)))
-        self.cycles += cycles
+        records = found.get(self._cycle_channel, [])
+        if any(len(data) != self.layout.size for data in records):
+            raise CorruptLog(f"{self._name}: damaged at byte {chunk.start}: a cycle record of the wrong size")
+        self._chunks.append(_ChunkRef(chunk, self.cycles, len(records), frozenset(found)))
+        self.cycles += len(records)
+        if self._visit is not None:
+            for channel, messages in found.items():
+                self._visit(self, self._topics.get(channel, ""), messages)
 
     def _meet(self, channel: Channel) -> None:
         self._topics[channel.id] = channel.topic
@@ -203,20 +233,22 @@ class Log:
             )
         self._cycle_channel = channel.id
 
-    def _load_params(self) -> Params:
+    def _load_params(self, name: str) -> Params:
         if schema.PARAMS not in self.attachments:
             raise ForeignFile(
                 f"{self._name}: no {schema.PARAMS} in it: not a recording, or cut off before its first cycle"
             )
-        name = schema.DECIDED if schema.DECIDED in self.attachments else schema.PARAMS
         try:
             return Params.from_canonical(self.attachments[name])
         except (ValueError, TypeError, KeyError) as error:
             raise ForeignFile(f"{self._name}: {name} is of another version: {error}") from error
 
 
-def open_log(path: str | Path) -> Log:
-    """Map and check the whole file. LogError: not readable, foreign, damaged."""
+def open_log(path: str | Path, visit: Visitor | None = None, progress: Progress = iter) -> Log:
+    """Map and check the whole file. `visit` meets the messages on the way; `progress` goes over the megabytes.
+
+    LogError: not readable, foreign, damaged.
+    """
     path = Path(path)
     try:
         with open(path, "rb") as file:
@@ -225,7 +257,7 @@ def open_log(path: str | Path) -> Log:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    return Log(path, data)
+    return Log(path, data, visit, progress)
 
 
 def records(path: str | Path) -> Records:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from logs.mcap_scan import CorruptLog
-from logs.reader import Log, LogMessage, Records, open_log
+from logs.reader import Log, LogMessage, Progress, Records, Visitor, open_log
 from logs.session_files import manifest_path, part_path
 
 
@@ -58,6 +58,20 @@ class Recording:
             sha.update(memoryview(part.data))
         return sha.hexdigest()
 
+    def around(self, t_ns: int, span_ns: int) -> Recording:
+        """The recording as if it held only the cycles up to `span_ns` before and after monotonic `t_ns`."""
+        offset = self.layout.dtype.fields["inputs.t_ns"][1]  # type: ignore[index]
+        ends = (t_ns - span_ns, t_ns + span_ns)
+        first, stop = (
+            bisect.bisect_left(
+                range(self.cycles), end, key=lambda i: int.from_bytes(self.record(i)[offset : offset + 8], "little")
+            )
+            for end in ends
+        )
+        near = ((part, before) for part, before in zip(self.parts, self._first, strict=True))
+        kept = [part.excerpt(first - before, stop - before) for part, before in near]
+        return Recording(tuple(part for part in kept if part.cycles))
+
     @property
     def topics(self) -> frozenset[str]:
         return frozenset().union(*(part.topics for part in self.parts))
@@ -83,16 +97,18 @@ class Recording:
         return itertools.chain.from_iterable(part.messages(*topics) for part in self.parts)
 
 
-def open_recording(path: str | Path) -> Recording:
+def open_recording(path: str | Path, visit: Visitor | None = None, progress: Progress = iter) -> Recording:
     """Map and check every file of the session that begins with `path`; a later part alone is read alone.
+
+    `visit` meets the messages on the way, see `reader.Visitor`; `progress` goes over the megabytes of each file.
 
     LogError: not readable, foreign, damaged; CorruptLog also: a part is missing, or is not of this session.
     """
-    parts = [open_log(path)]
+    parts = [open_log(path, visit, progress)]
     if parts[0].session.get("part", "1") == "1":
         place = Path(path).resolve()  # the other files are beside the file itself, not beside a link to it
         while (following := part_path(place, len(parts) + 1)).exists():
-            parts.append(_continued(open_log(following), parts))
+            parts.append(_continued(open_log(following, visit, progress), parts))
         if (manifest := manifest_path(place)).is_file():
             _check_manifest(manifest, parts, place.name)
     return Recording(tuple(parts))

@@ -22,7 +22,7 @@ from mcap.records import Metadata as MetadataRecord
 from asc_rt import ring
 from logs import mcap_scan, schema, seal
 from logs.mcap_scan import Bytes, Extent, LogError, Op, Raw
-from logs.mcap_writer import Appender, Index, McapWriter, encode
+from logs.mcap_writer import Appender, Index, McapWriter, message_index
 from logs.reader import Log, open_log
 
 COPY_SIZE = 16 << 20
@@ -129,13 +129,13 @@ def _complete_last_chunk(writer: McapWriter, data: Bytes, name: str) -> None:
     last = writer.index.chunks[-1]
     start = last.chunk_start_offset
     content = mcap_scan.chunk_data(data, name, Raw(Op.CHUNK, start, start + 9, start + last.chunk_length))
-    entries: dict[int, list[tuple[int, int]]] = {}
+    entries: dict[int, list[int]] = {}
     for inner in mcap_scan.chunk_records(content, name):
         if inner.op == Op.MESSAGE:
             message = mcap_scan.message(content, inner)
-            entries.setdefault(message.channel, []).append((message.log_time_ns, inner.start))
+            entries.setdefault(message.channel, []).extend((message.log_time_ns, inner.start))
     for channel in entries.keys() - last.message_index_offsets.keys():
-        record = encode(MessageIndex(channel, entries[channel]))
+        record = message_index(channel, entries[channel])
         last.message_index_offsets[channel] = writer.file.size
         last.message_index_length += len(record)
         writer.file.append(record)
@@ -152,11 +152,10 @@ def _add_rings(writer: McapWriter, log: Log, path: Path) -> int:
     for payload in _held(path):
         if len(payload) != layout.size:
             raise ring.RingError(f"{path}: made for another record", hint="give the ring of this session")
-        record = bytearray(payload)
-        layout.seal(record)
+        record = layout.sealed(payload)
         row = np.frombuffer(record, layout.dtype)[0]
         if int(row["inputs.tick"]) > newest:
-            cycles.add(int(row["inputs.t_ns"]) + wall, bytes(record))
+            cycles.add(int(row["inputs.t_ns"]) + wall, record)
     channels = {"rx": _Adder(writer, schema.WIRE_RX), "tx": _Adder(writer, schema.WIRE_TX)}
     last_ns = max((m.t_ns for m in log.messages(schema.WIRE_RX.topic, schema.WIRE_TX.topic)), default=-1)
     for payload in _held(ring.wire_path(path)):
@@ -185,7 +184,7 @@ class _Adder:
         self._sequence = writer.index.counts.get(self._channel, 0)
 
     def add(self, t_ns: int, data: bytes) -> None:
-        self._writer.message(self._channel, self._sequence + self.count, t_ns, data)
+        self._writer.messages(self._channel, self._sequence + self.count, (t_ns,), (data,))
         self.count += 1
 
 

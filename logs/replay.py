@@ -23,11 +23,11 @@ from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs
 from asc_rt.fingerprint import fingerprint
 from asc_rt.fixed_protobuf import RecordError
 from logs.diff import Difference, altered, differences
+from logs.reader import Progress
 from logs.recording import Recording, open_recording
-from logs.wire import FIELDS, Column, replay_wire
+from logs.wire import FIELDS, Column, Packets, replay_wire
 
 Stepper = Callable[[CoreState, CycleInputs], tuple[CoreState, CycleOutputs]]
-Progress = Callable[[Iterable[int]], Iterable[int]]  # like tqdm
 
 TOLERANCE = (
     1e-6  # SI units. Another processor rounds the QP and the trigonometry differently (ASSUMED; 1e-9 is typical)
@@ -105,11 +105,12 @@ def replay(
     stepper: Callable[[Params], Stepper] = core_stepper,
     cycles: Sequence[int] | None = None,
     columns: dict[str, Column] | None = None,
+    packets: Packets | None = None,
     jobs: int = 1,
     progress: Progress = iter,
 ) -> ReplayReport:
     """Run the records from number `start` (0 = first) on again, or just `cycles`. `jobs`: processes that share it.
-    `columns`: `logs.wire.FIELDS` of all cycles, if they are at hand.
+    `columns`: `logs.wire.FIELDS` of all cycles, `packets`: all of them, if they are at hand.
 
     LogError: the file. IndexError: fewer records than `start`.
     """
@@ -127,7 +128,7 @@ def replay(
     else:
         _replay_shared(found, log.path, stepper, numbers, tolerance, jobs, progress)
     columns = columns or log.columns(*FIELDS)
-    gaps, wire = int((np.diff(columns["inputs.tick"]) != 1).sum()), replay_wire(log, columns, cycles)
+    gaps, wire = int((np.diff(columns["inputs.tick"]) != 1).sum()), replay_wire(log, columns, cycles, packets)
     return ReplayReport(
         found.count, found.mismatches, found.exact, match, found.first, wire.mismatches, wire.first, wire.decoded, gaps,
         tolerance, found.largest, log.truncated,

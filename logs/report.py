@@ -15,6 +15,7 @@ import numpy as np
 
 from asc_rt.core.types import Mode
 from logs.audit_evidence import Column, Evidence
+from logs.latency import BIN_MS, photon_to_command_ns, statistics
 
 WIDTH, HEIGHT, LEFT, BOTTOM = 1000, 150, 64, 22  # px
 BINS = 900  # across a plot; each shows its least and greatest value, so that no peak is lost
@@ -81,10 +82,14 @@ def html_report(report: dict[str, Any], e: Evidence | None, pictures: Sequence[P
         body.append(f"<p class='s'>No pictures: {_text(note)}</p>")
     body += ["<h2>What it is about</h2>", _table(report.get("session", {})), "<h2>Attachments</h2>"]
     body += [_table(report.get("attachments", {})), _limits(report)]
-    page = "".join([*head, *body])
+    return page(f"Audit of {report['log']}", "".join([*head, *body]))
+
+
+def page(title: str, body: str) -> str:
+    """One HTML file that needs nothing else."""
     return (
-        f"<!doctype html><html lang='en'><meta charset='utf-8'><title>Audit of {_text(report['log'])}</title>"
-        f"<style>{_STYLE}</style><body>{page}</body></html>\n"
+        f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{_text(title)}</title>"
+        f"<style>{_STYLE}</style><body>{body}</body></html>\n"
     )
 
 
@@ -157,7 +162,35 @@ def _plots(e: Evidence) -> list[str]:
         plot("age of the person's state [ms]",
              e.t_s, [Line("age", age, "#2f7d52")], p.human.age_limit_ns * 1e-6, "limit", marks),
         plot("wake to sent [ms]", e.t_s, [Line("cycle", spent, "#555b63")], p.period_ns * 1e-6, "period", marks),
+        _photon_to_command(e),
     ]  # fmt: skip
+
+
+def _photon_to_command(e: Evidence) -> str:
+    """How often it took how long from a capture to the set-point that rests on it."""
+    found = statistics(photon_to_command_ns(e.c))["histogram"]
+    title = f"photon to command, cycles per {BIN_MS:g} ms"
+    if not found:
+        return ""
+    first, last = found[0][0], found[-1][0] + BIN_MS
+    most, width = max(count for _, count in found), (WIDTH - LEFT - 8) * BIN_MS / (last - first)
+    bars = []
+    for begin, count in found:
+        height = (HEIGHT - BOTTOM) * count / most
+        x, y = LEFT + (WIDTH - LEFT - 8) * (begin - first) / (last - first), HEIGHT - BOTTOM - height
+        what = f"{begin:g} to {begin + BIN_MS:g} ms: {count}"
+        bars.append(
+            f"<rect x='{x:.1f}' y='{y:.1f}' width='{max(width - 1, 1):.1f}' height='{height:.1f}' fill='#1f5fa8'>"
+            f"<title>{what}</title></rect>"
+        )
+    ends = "".join(
+        f"<text x='{x}' y='{HEIGHT - 6}' font-size='12' text-anchor='{anchor}' fill='#555b63'>{value:g} ms</text>"
+        for x, value, anchor in ((LEFT, first, "start"), (WIDTH - 8, last, "end"))
+    )
+    return (
+        f"<figure><figcaption>{title}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img'>"
+        f"{''.join(bars)}{ends}</svg></figure>"
+    )
 
 
 def plot(title: str, t_s: Column, lines: Sequence[Line], limit: float, name: str, marks: Sequence[Moment] = ()) -> str:

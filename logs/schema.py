@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import re
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +12,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, ti
 from google.protobuf.message import DecodeError
 
 from asc_rt import human_state_pb2, record
+from asc_rt.fixed_protobuf import FIXED64, LENGTH, VARINT, tag, varint
 
 PROFILE = "asc"  # of the MCAP header
 LIBRARY = "asc-rt logs.writer"
@@ -70,8 +73,16 @@ _Wire = _message_class("asc.v1.Wire", _wire_file())
 
 def wire_message(t_ns: int, length: int, data: bytes) -> bytes:
     """A packet of `length` bytes that passed at monotonic `t_ns`; `data`: its beginning, or all of it."""
-    message: bytes = _Wire(t_ns=t_ns, length=length, data=data).SerializeToString()
-    return message
+    return _WIRE_STAMP.pack(_WIRE_STAMP_TAG, t_ns) + _wire_head(length, len(data)) + data
+
+
+_WIRE_STAMP, _WIRE_STAMP_TAG = struct.Struct("<Bq"), 1 << 3 | FIXED64
+
+
+@functools.lru_cache(256)
+def _wire_head(length: int, size: int) -> bytes:
+    """Field 2, and tag and size of field 3. Written out, because every packet of every cycle passes here."""
+    return tag(2, VARINT) + varint(length) + tag(3, LENGTH) + varint(size)
 
 
 def parse_wire_message(message: bytes) -> tuple[int, int, bytes]:
@@ -84,7 +95,8 @@ def parse_wire_message(message: bytes) -> tuple[int, int, bytes]:
 
 
 def _foxglove_file() -> descriptor_pb2.FileDescriptorProto:
-    """FrameTransforms, Log and CompressedImage of Foxglove's schemas: the fields that we fill, under their numbers."""
+    """FrameTransforms, Log, CompressedImage and CameraCalibration of Foxglove's schemas: the fields that we fill, under
+    their numbers."""
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="foxglove/asc.proto", package="foxglove", syntax="proto3")
     file.dependency.append("google/protobuf/timestamp.proto")
@@ -95,7 +107,7 @@ def _foxglove_file() -> descriptor_pb2.FileDescriptorProto:
     def message(type_name: str, /, **fields: tuple[int, int, str]) -> None:
         made = file.message_type.add(name=type_name)
         for key, (number, kind, of) in fields.items():
-            label = field.LABEL_REPEATED if key == "transforms" else field.LABEL_OPTIONAL
+            label = field.LABEL_REPEATED if key in ("transforms", *"DKRP") else field.LABEL_OPTIONAL
             made.field.add(name=key, number=number, label=label, type=kind, type_name=of or None)
 
     stamp = field.TYPE_MESSAGE, ".google.protobuf.Timestamp"
@@ -111,6 +123,11 @@ def _foxglove_file() -> descriptor_pb2.FileDescriptorProto:
     message(
         "CompressedImage", timestamp=(1, *stamp), data=(2, field.TYPE_BYTES, ""), format=(3, *text),
         frame_id=(4, *text),
+    )  # fmt: skip
+    size = field.TYPE_FIXED32, ""
+    message(
+        "CameraCalibration", timestamp=(1, *stamp), width=(2, *size), height=(3, *size), distortion_model=(4, *text),
+        D=(5, *real), K=(6, *real), R=(7, *real), P=(8, *real), frame_id=(9, *text),
     )  # fmt: skip
     message("Log", timestamp=(1, *stamp), level=(2, *level_type), message=(3, *text), name=(4, *text))
     return file
@@ -129,6 +146,7 @@ _FOXGLOVE = _file_set(_timestamp_file(), _foxglove_file())
 FrameTransforms = _message_class("foxglove.FrameTransforms", _timestamp_file(), _foxglove_file())
 _Log = _message_class("foxglove.Log", _timestamp_file(), _foxglove_file())
 CompressedImage = _message_class("foxglove.CompressedImage", _timestamp_file(), _foxglove_file())
+CameraCalibration = _message_class("foxglove.CameraCalibration", _timestamp_file(), _foxglove_file())
 
 
 def log_message(wall_ns: int, level: str, text: str) -> bytes:
@@ -178,6 +196,7 @@ LOG = Channel("/log", "protobuf", "foxglove.Log", _FOXGLOVE)
 JOINT_STATES = Channel("/joint_states", "cdr", "sensor_msgs/msg/JointState", _JOINT_STATE)
 ROBOT_DESCRIPTION = Channel("/robot_description", "cdr", "std_msgs/msg/String", b"string data\n")
 CAMERAS = "/cell/camera/"  # and the camera's name: one channel each, from its first image on
+CALIBRATION = "/calibration"  # behind it: what its lens does, so that viewers can place the image
 HELLO = Channel("/session")  # one message before all others, so that the schemas are on disk from the first moment
 
 _CAMERA_NAME = re.compile(r"[a-z0-9_-]{1,32}")
@@ -186,13 +205,22 @@ _CAMERA_NAME = re.compile(r"[a-z0-9_-]{1,32}")
 def camera(image: bytes) -> Channel | None:
     """The channel of a foxglove.CompressedImage: depth as 16-bit PNG, or colour; its frame_id names the camera. None:
     no such image."""
+    return _of_camera(CompressedImage, image)
+
+
+def camera_calibration(calibration: bytes) -> Channel | None:
+    """The channel of a foxglove.CameraCalibration, beside that of the camera's images. None: no such message."""
+    return _of_camera(CameraCalibration, calibration, CALIBRATION)
+
+
+def _of_camera(kind: Any, message: bytes, suffix: str = "") -> Channel | None:
     try:
-        name = CompressedImage.FromString(image).frame_id
+        name = kind.FromString(message).frame_id
     except DecodeError:
         return None
     if not _CAMERA_NAME.fullmatch(name):
         return None
-    return Channel(CAMERAS + name, "protobuf", "foxglove.CompressedImage", _FOXGLOVE)
+    return Channel(f"{CAMERAS}{name}{suffix}", "protobuf", kind.DESCRIPTOR.full_name, _FOXGLOVE)
 
 
 DRAWN = (ROBOT_DESCRIPTION, TRANSFORMS, JOINT_STATES, LOG)  # for viewers that know nothing of us

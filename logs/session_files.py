@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +47,11 @@ class SessionFiles:
         return log
 
     def message(self, channel: schema.Channel, t_ns: int, data: bytes) -> None:
-        self.log.message(channel, t_ns, data)
-        self._cycles += channel is schema.CYCLE
+        self.messages(channel, (t_ns,), (data,))
+
+    def messages(self, channel: schema.Channel, times: Sequence[int], contents: Sequence[bytes]) -> None:
+        self.log.messages(channel, times, contents)
+        self._cycles += len(contents) if channel is schema.CYCLE else 0
 
     def json(self, channel: schema.Channel, t_ns: int, value: Mapping[str, Any]) -> None:
         self.log.json(channel, t_ns, value)

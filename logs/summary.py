@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from asc_rt.core.types import Mode, Status, StopReason
-from logs import schema
+from logs import latency, schema
 from logs.mcap_scan import LogError
 from logs.recording import Recording, open_recording
 
@@ -26,7 +26,8 @@ _AT_STOP = (Mode.STOPPING, Mode.STOPPED, Mode.FAULT)
 _COLUMNS = (
     "state.mode", "state.reason", "state.reached_id",
     "inputs.tick", "inputs.t_ns", "inputs.missed_ticks", "inputs.late", "inputs.joint.present", "inputs.joint.t_rx_ns",
-    "outputs.decision.status", "outputs.decision.reason", "outputs.decision.d_measured",
+    "outputs.decision.status", "outputs.decision.reason", "outputs.decision.d_measured", "outputs.decision.d_goal",
+    "state.goal.id",
     "outputs.command.present", "outputs.command.is_last", "outputs.stop.present",
     "timings.t_wake_ns", "timings.t_write_end_ns",
 )  # fmt: skip
@@ -35,8 +36,8 @@ _COLUMNS = (
 def summarise(path: str | Path) -> dict[str, Any]:
     """JSON-able; None where the log cannot tell. LogError: the file."""
     log = open_recording(path)
-    c = log.columns(*_COLUMNS)
-    truth = _Truth(log, c["inputs.t_ns"])
+    c = log.columns(*dict.fromkeys((*_COLUMNS, *latency.COLUMNS)))
+    truth = Truth(log, c["inputs.t_ns"])
     truth_distance = truth.distance[np.isfinite(truth.distance)]
     measured = c["outputs.decision.d_measured"]
     distances = truth_distance if len(truth.distance) else measured[np.isfinite(measured)]
@@ -46,17 +47,25 @@ def summarise(path: str | Path) -> dict[str, Any]:
         "missed_deadlines": int(np.maximum(c["inputs.missed_ticks"], c["inputs.late"]).sum()),
         "cycle_us": _percentiles(c["timings.t_write_end_ns"] - c["timings.t_wake_ns"]),
         "wake_us": _percentiles(_wake_ns(c)),
+        "photon_to_command_ms": latency.statistics(latency.photon_to_command_ns(c)),
         "min_distance_m": float(distances.min()) if len(distances) else None,
         "robot_caused_violations": truth.violations(log.params.safety.d_min) if len(truth.distance) else None,
         "contacts": truth.contacts,
         "infeasible_cycles": int((c["outputs.decision.status"] == Status.INFEASIBLE).sum()),
         "goals_reached": int((np.diff(c["state.reached_id"]) > 0).sum()),
+        "goal_blocked_s": round(int(_blocked(c, log.params.safety.d_min).sum()) * log.params.period, 3),
         "stops": stops(c),
         "dropped_records": dropped(log, c["inputs.tick"]),
         "log": str(path),
         "exit_reason": exit_reason(c),
         "truncated": log.truncated,
     }
+
+
+def _blocked(c: dict[str, Column], d_min: float) -> Column:
+    """Cycles in which the arm worked towards a goal where it would have been nearer to a person than d_min."""
+    underway = (c["state.mode"] == Mode.ACTIVE) & (c["state.goal.id"] != c["state.reached_id"])
+    return underway & (c["outputs.decision.d_goal"] < d_min)
 
 
 def stops(c: dict[str, Column]) -> list[dict[str, Any]]:
@@ -128,7 +137,7 @@ def _percentiles(ns: Column) -> dict[str, float | None]:
     }
 
 
-class _Truth:
+class Truth:
     """What the simulated plant says really happened while the session ran; empty for a real robot."""
 
     def __init__(self, log: Recording, t_ns: Column) -> None:
@@ -139,6 +148,7 @@ class _Truth:
             far = math.inf
             self.distance = np.array([far if r["distance_m"] is None else r["distance_m"] for r in rows], float)
             self.approach = np.array([r["approach_m_s"] for r in rows], float)
+            self.q = [np.array(r.get("q", []), float) for r in rows]
             contact = np.array([r["contact"] for r in rows], bool)
         except (ValueError, TypeError, KeyError) as error:
             raise LogError(f"{log.path}: {schema.TRUTH.topic} holds something else than the plant's truth") from error

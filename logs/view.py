@@ -31,6 +31,7 @@ __all__ = ["ViewError", "view", "write_rrd"]
 
 # Cycles that the scene shows at most: ten minutes at 125 Hz, 150 MB. The plots always have them all.
 SCENE_CYCLES = 75_000
+PICTURE_S = 60.0  # of the session before and after the moment of a picture
 
 
 def view(
@@ -48,23 +49,25 @@ def view(
     if save is not None:
         write_rrd(log, save, moment_ns)
     if shot is not None:
-        _shoot(log, shot, moment_ns)
+        shot.write_bytes(picture(log, (moment_ns - start_ns) * 1e-9))
     if save is None and shot is None:
         _show(log, moment_ns, web)
 
 
-def write_rrd(log: Recording, path: Path, moment_ns: int, picture: bool = False) -> None:
-    """The whole recording with its layout, as the viewer's own file. `moment_ns`: what the eye is set up for, on the
-    clock of the record. `picture`: without menus. ViewError: no cycles in it."""
-    start_ns, end_ns = _extent(log)
+def write_rrd(log: Recording, path: Path, moment_ns: int, part: Recording | None = None) -> None:
+    """The recording with its layout, as the viewer's own file. `moment_ns`: what the eye is set up for, on the clock of
+    the record. `part`: all that is drawn, for a picture, without menus. ViewError: no cycles in it."""
+    start_ns = _extent(log)[0]
+    whole, log, picture = log, part or log, part is not None
+    first_ns, end_ns = _extent(log)
     with open(path, "wb"):  # an error of the path is ours to tell, in one line
         pass
     recording = new_recording(log.path.stem)
     recording.save(path)
     seen = focus(log, moment_ns, round(WINDOW_S * 1e9))
-    cameras = sorted(topic.removeprefix("/cell/") for topic in log.topics if topic.startswith(schema.CAMERAS))
-    length_s = (end_ns - start_ns) * 1e-9
-    recording.send_blueprint(layout(log.params, length_s, seen.joint, seen.towards, picture, cameras))
+    cameras = [topic.removeprefix("/cell/") for topic in _cameras(log)]
+    shown_s = ((first_ns - start_ns) * 1e-9, (end_ns - start_ns) * 1e-9)
+    recording.send_blueprint(layout(log.params, shown_s, seen.joint, seen.towards, picture, cameras))
     canvas = Canvas(recording, log.params, start_ns, math.ceil(log.cycles / SCENE_CYCLES))
     chronicle = Chronicle(canvas)
     events: list[Event] = []
@@ -74,10 +77,10 @@ def write_rrd(log: Recording, path: Path, moment_ns: int, picture: bool = False)
             canvas.draw(now, following)
             events += chronicle.draw(now, following)
             bar.update(len(now))
-    _draw_truth(canvas, log, start_ns, end_ns)
-    _draw_cameras(canvas, log, start_ns, end_ns)
+    _draw_truth(canvas, log, first_ns, end_ns)
+    _draw_cameras(canvas, log, first_ns, end_ns)
     events += draw_near_misses(canvas, nearest_moments(log))
-    events.append(ending(log, end_ns))
+    events.append(ending(whole))
     draw_events(canvas, events)
     recording.flush()
     recording.disconnect()
@@ -99,11 +102,17 @@ def _draw_truth(canvas: Canvas, log: Recording, start_ns: int, end_ns: int) -> N
 
 def _draw_cameras(canvas: Canvas, log: Recording, start_ns: int, end_ns: int) -> None:
     """What the cameras saw; depth images in metres."""
-    for topic in sorted(topic for topic in log.topics if topic.startswith(schema.CAMERAS)):
+    for topic in _cameras(log):
         for message in log.messages(topic):
             if start_ns <= message.t_ns <= end_ns:
                 image = schema.CompressedImage.FromString(message.data)
                 canvas.image(topic.removeprefix("/cell/"), message.t_ns, image.format, image.data)
+
+
+def _cameras(log: Recording) -> list[str]:
+    """Topics with images."""
+    found = (topic for topic in log.topics if topic.startswith(schema.CAMERAS))
+    return sorted(topic for topic in found if not topic.endswith(schema.CALIBRATION))
 
 
 def _extent(log: Recording) -> tuple[int, int]:
@@ -115,11 +124,15 @@ def _extent(log: Recording) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _shoot(log: Recording, path: Path, moment_ns: int) -> None:
+def picture(log: Recording, at_s: float) -> bytes:
+    """PNG of the moment `at_s` after the start, with PICTURE_S before and after it: an hour is not drawn for one
+    moment. ViewError."""
+    start_ns = _extent(log)[0]
+    moment_ns = start_ns + round(at_s * 1e9)
     with tempfile.TemporaryDirectory(prefix="asc-view-") as folder:
         rrd = Path(folder, f"{log.path.stem}.rrd")
-        write_rrd(log, rrd, moment_ns, picture=True)
-        path.write_bytes(screenshot(rrd, moment_ns - _extent(log)[0]))
+        write_rrd(log, rrd, moment_ns, log.around(moment_ns, round(PICTURE_S * 1e9)))
+        return screenshot(rrd, moment_ns - start_ns)
 
 
 def _show(log: Recording, moment_ns: int, web: bool) -> None:

@@ -16,6 +16,7 @@ import rerun as rr
 
 from asc_rt.core import robot_model
 from asc_rt.core.params import Params
+from asc_rt.core.types import Basis
 from logs.view_geometry import Segments, connecting_lines, poses, robot_segments
 from logs.view_layout import APPLICATION, BLUE, FLOOR_Z, ORANGE, TIMELINE, log_styles, phi_colours
 
@@ -24,6 +25,7 @@ Records = np.ndarray[Any, np.dtype[np.void]]
 
 PNG_GREY_16 = b"\x10\x00"  # bit depth and colour type in the header
 ROWS = 1000  # cycles in one block
+MONITOR = ("distance", "protective_distance")
 DECISION, PAIRS, HUMAN = "outputs.decision", "outputs.decision.pairs", "inputs.human"
 PERSON, TOOL_COLOUR, PEDESTAL = (214, 158, 120, 255), (200, 70, 60, 255), (58, 60, 66, 255)
 JUDGED_ARM, JUDGED_PERSON = (*BLUE, 45), (*ORANGE, 50)
@@ -176,7 +178,10 @@ class Canvas:
         t_ns, safety, some = now["inputs.t_ns"], self.params.safety, now[f"{PAIRS}.count"] > 0
         heard = now[f"{HUMAN}.present"] == 1
         measured = now[f"{DECISION}.d_measured"]
+        watched = (now[f"{DECISION}.monitor.present"] == 1) & np.isfinite(now[f"{DECISION}.monitor.distance"])
         nearest = {name: np.where(some, now[f"{PAIRS}.{name}"][:, 0], np.nan) for name in ("d", "d_dot", "M", "M_dot")}
+        for name in ("M", "M_dot"):  # a gap where they were not evaluated
+            nearest[name] = np.where(now[f"{PAIRS}.basis"][:, 0] == Basis.FREE, np.nan, nearest[name])
         listed = np.arange(now[f"{PAIRS}.phi"].shape[1]) < now[f"{PAIRS}.count"][:, None]
         worst = np.where(listed, now[f"{PAIRS}.phi"], -np.inf).max(axis=1)
         age = np.where(heard, now["inputs.human_age_ns"] * 1e-6, np.nan)
@@ -189,6 +194,7 @@ class Canvas:
             ("M", nearest["M"], safety.M_floor),
             ("M_dot", nearest["M_dot"]),
             ("age", age, limit),
+            ("monitor", *(np.where(watched, now[f"{DECISION}.monitor.{name}"], np.nan) for name in MONITOR)),
             ("cycle", busy, period),
         ):
             columns = [np.broadcast_to(np.asarray(values, float), len(now)) for values in series]

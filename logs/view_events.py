@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rerun as rr
 
-from asc_rt.core.types import EventKind, Health, Mode, Status, StopReason
+from asc_rt.core.types import EventKind, Health, MessageFault, Mode, Status, StopReason
 from logs.recording import Recording
 from logs.summary import exit_reason
 from logs.view_columns import DECISION, HUMAN, Array, Canvas, Records
@@ -74,18 +74,23 @@ def changes(now: Records, following: Records) -> list[Event]:
         found.append(Event(t[i], "ERROR", "no control keeps every row"))
     for i in _rises((now[f"{HUMAN}.present"] == 1) & (now[f"{HUMAN}.health"] != Health.OK)):
         found.append(Event(t[i], "WARN", f"person sensor: {Health(int(now[f'{HUMAN}.health'][i])).name}"))
-    for i in np.flatnonzero(now["inputs.human_fault"]):
-        found.append(Event(t[i], "WARN", "human data: a message that cannot be used"))
+    for k, fault in enumerate(now["inputs.sensors.fault"].T):
+        for i in _rises(fault != MessageFault.NONE):
+            sensor, refused = int(now["inputs.sensors.id"][i, k]), MessageFault(int(fault[i]))
+            found.append(Event(t[i], "WARN", f"sensor {sensor}: message refused: {refused.name}"))
+    for i in _rises(following["state.slow"] != StopReason.NONE):
+        found.append(Event(t[i], "WARN", f"slow: {StopReason(int(following['state.slow'][i])).name}"))
     for i in np.flatnonzero(now["inputs.missed_ticks"]):
         found.append(Event(t[i], "WARN", f"{int(now['inputs.missed_ticks'][i])} samples of the robot lost"))
     return found
 
 
-def ending(log: Recording, t_ns: int) -> Event:
+def ending(log: Recording) -> Event:
     """How the session ended, at its last cycle."""
-    names = (f"{DECISION}.reason", "state.mode", "outputs.stop.present", "outputs.command.present")
-    reason = exit_reason(log.columns(*names, "outputs.command.is_last"))
-    return Event(t_ns, "INFO" if reason == StopReason.SESSION_END.name else "ERROR", f"end of the session: {reason}")
+    last = np.frombuffer(log.record(log.cycles - 1), log.layout.dtype)
+    reason = exit_reason({name: last[name] for name in log.layout.dtype.names or ()})
+    level = "INFO" if reason == StopReason.SESSION_END.name else "ERROR"
+    return Event(int(last["inputs.t_ns"][0]), level, f"end of the session: {reason}")
 
 
 def _rises(condition: Array) -> Array:

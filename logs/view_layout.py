@@ -49,6 +49,10 @@ PLOTS: dict[str, tuple[str, list[tuple[str, Colour, float]]]] = {
     "M": ("M of the nearest pair, m/s2 (red: floor)", [("M", BLUE, 1.5), ("M_floor", RED, 1.0)]),
     "M_dot": ("M_dot of the nearest pair, m/s3", [("M_dot", BLUE, 1.5)]),
     "age": ("age of the human data, ms (red: limit)", [("age", BLUE, 1.5), ("limit", RED, 1.0)]),
+    "monitor": (
+        "speed and separation, m: distance to where the person was seen, protective distance S_p",
+        [("distance", BLUE, 2.0), ("S_p", RED, 1.5)],
+    ),
     "cycle": ("one cycle, ms (red: period)", [("wake to write", BLUE, 1.5), ("period", RED, 1.0)]),
 }
 TRUE_DISTANCE = "plot/distance_true"
@@ -85,23 +89,23 @@ LIVE_S = 60.0  # what the plots of the whole session show while it goes on
 
 def layout(
     params: Params,
-    duration_s: float | None,
+    session_s: tuple[float, float] | None,
     joint: int = 0,
     towards: float = 0.0,
     picture: bool = False,
     cameras: Sequence[str] = (),
 ) -> rrb.Blueprint:
-    """Left: the scene, the whole session, what happened. Right: the seconds around the cursor.
+    """Left: the scene, the whole of it, what happened. Right: the seconds around the cursor.
 
     `joint`: index of the one whose control is in front. `towards`: direction of the person from the base, rad from x;
-    the eye looks across it. `duration_s`: of the session; None: it goes on, and the cursor follows the newest cycle.
-    `picture`: without menus. `cameras`: entities with images, shown beside the scene.
+    the eye looks across it. `session_s`: begin and end of what is shown; None: it goes on, and the cursor follows the
+    newest cycle. `picture`: without menus. `cameras`: entities with images, shown beside the scene.
     """
-    live = duration_s is None
+    live = session_s is None
     window = _around_cursor(-2.0 * WINDOW_S, 0.0) if live else _around_cursor(-WINDOW_S, WINDOW_S)
-    session = _around_cursor(-LIVE_S, 0.0) if duration_s is None else _absolute(0.0, duration_s)
+    session = _around_cursor(-LIVE_S, 0.0) if session_s is None else _absolute(*session_s)
     reach = 1.2 * params.safety.activation_distance
-    whole = _plot("distance, whole session, m", DISTANCES, session, (-0.1, reach))
+    whole = _plot("distance, over all that is shown, m", DISTANCES, session, (-0.1, reach))
     eyes = [rrb.Spatial2DView(name=entity, origin=f"/{entity}") for entity in cameras]
     scene = rrb.Horizontal(_scene(towards), rrb.Vertical(*eyes), column_shares=[3.0, 1.0]) if eyes else _scene(towards)
     left = rrb.Vertical(scene, whole, _states(session), _events(), row_shares=[6.0, 1.4, 1.7, 1.7])
@@ -111,7 +115,7 @@ def layout(
         *(_plot(f"u {name}", [f"+ /plot/u/{name}"], window, legend=True) for name in params.robot.joints),
         active_tab=joint,
     )
-    small = rrb.Grid(single["M"], single["M_dot"], single["age"], single["cycle"], grid_columns=2)
+    small = rrb.Grid(single["M"], single["M_dot"], single["monitor"], single["age"], single["cycle"], grid_columns=2)
     right = rrb.Vertical(
         single["distance"], single["phi"], control, single["d_dot"], small, row_shares=[1.6, 1.2, 1.3, 1.0, 1.8]
     )
@@ -155,7 +159,7 @@ def _absolute(start_s: float, end_s: float) -> rrb.TimeAxis:
 
 
 def _states(window: rrb.TimeAxis) -> rrb.StateTimelineView:
-    return rrb.StateTimelineView(name="mode and filter, whole session", origin="/state", time_view=window)
+    return rrb.StateTimelineView(name="mode and filter, over all that is shown", origin="/state", time_view=window)
 
 
 def _events() -> rrb.TextLogView:

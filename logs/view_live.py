@@ -63,7 +63,7 @@ def live(params: Params, ring: Path, web: bool = False) -> None:
             wait_for(lambda: _listens(port), running)
             recording = new_recording(ring.name)
             recording.connect_grpc(address(port))
-            recording.send_blueprint(layout(params, duration_s=None))
+            recording.send_blueprint(layout(params, session_s=None))
             painter = Painter(recording, params, dtype)
             with contextlib.suppress(KeyboardInterrupt):
                 while running.process.poll() is None:

@@ -6,7 +6,6 @@ A driver without `drivers.base.ReplayCodec` can be checked for the presence of i
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,19 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from asc_rt.core.types import CommandKind, JointCommand
 from drivers import registry
 from drivers.base import DriverError, ReplayCodec
 from logs import schema
 from logs.recording import Recording
 
 Column = np.ndarray[Any, Any]
+Packets = tuple[dict[int, bytes], dict[int, bytes]]  # received and sent: time -> bytes
 
 TOLERANCE = 1e-6  # rad: float32 degrees of the wire are up to 2.7e-7 rad off
 
 FIELDS = (
     "inputs.tick", "inputs.joint.present", "inputs.joint.t_rx_ns", "inputs.joint.seq", "inputs.joint.q",
     "inputs.joint.current", "receipt.present", "receipt.ok", "receipt.t_tx_ns", "receipt.seq", "receipt.q",
-    "outputs.command.q", "outputs.command.is_last",
+    "outputs.command.kind", "outputs.command.q", "outputs.command.dq", "outputs.command.tau",
+    "outputs.command.is_last",
 )  # fmt: skip
 
 
@@ -39,14 +41,18 @@ class WireReport:
 
 
 def replay_wire(
-    log: Recording, columns: dict[str, Column] | None = None, decode: Sequence[int] | None = None
+    log: Recording,
+    columns: dict[str, Column] | None = None,
+    decode: Sequence[int] | None = None,
+    passed: Packets | None = None,
 ) -> WireReport:
-    """`columns`: FIELDS of all cycles, if they are at hand. `decode`: cycles that go through the codec; None: all.
+    """`columns`: FIELDS of all cycles, `passed`: all packets, if they are at hand. `decode`: cycles that go through
+    the codec; None: all.
 
     LogError: the file.
     """
     c = columns or log.columns(*FIELDS)
-    received, sent = packets(log)
+    received, sent = passed or packets(log)
     codec = codec_of(log)
     if not received and not sent:
         return WireReport(0, codec is not None, 0, "")
@@ -56,7 +62,7 @@ def replay_wire(
     checks = {
         "no packet was received at the time of its sample": heard & ~_among(c["inputs.joint.t_rx_ns"], received),
         "no packet was sent at the time of its command": claimed & ~_among(c["receipt.t_tx_ns"], sent),
-        "something else was sent than decided": claimed & ~(off <= TOLERANCE),
+        "something else was sent than decided": claimed & ~(off <= getattr(codec, "resolution", TOLERANCE)),
     }
     wrong = {int(i): words for words, bad in checks.items() for i in np.flatnonzero(bad)}
     if codec is not None:
@@ -94,9 +100,7 @@ def codec_of(log: Recording) -> ReplayCodec | None:
     return driver if isinstance(driver, ReplayCodec) else None
 
 
-@functools.lru_cache(1)
-def packets(log: Recording) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Received and sent: time -> bytes."""
+def packets(log: Recording) -> Packets:
     found: dict[str, dict[int, bytes]] = {schema.WIRE_RX.topic: {}, schema.WIRE_TX.topic: {}}
     for message in log.messages(*found):
         t_ns, _, data = schema.parse_wire_message(message.data)
@@ -119,6 +123,8 @@ def _heard(c: dict[str, Column], i: int, received: dict[int, bytes], codec: Repl
 
 def _said(c: dict[str, Column], i: int, sent: dict[int, bytes], codec: ReplayCodec) -> str:
     """What is wrong with the command of cycle i; "": nothing."""
-    last = bool(c["outputs.command.is_last"][i])
-    again = codec.encode_set_point(int(c["receipt.seq"][i]), c["outputs.command.q"][i], last)
+    kind, last = CommandKind(int(c["outputs.command.kind"][i])), bool(c["outputs.command.is_last"][i])
+    q, dq, tau = (c[f"outputs.command.{name}"][i] for name in ("q", "dq", "tau"))
+    command = JointCommand(int(c["inputs.tick"][i]), kind, q, dq, tau, last)
+    again = codec.encode_command(int(c["receipt.seq"][i]), command)
     return "" if again == sent[int(c["receipt.t_tx_ns"][i])] else "its command encodes to other bytes than were sent"

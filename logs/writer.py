@@ -13,6 +13,7 @@ import json
 import math
 import os
 import signal
+import struct
 import sys
 import time
 from collections.abc import Callable
@@ -33,10 +34,10 @@ from logs.display import Display
 from logs.seal import KeyFileError, load_key
 from logs.session_files import SessionFiles
 
-POLL_S = 0.05
+POLL_S = 0.02  # joints reach perception so late at most: beyond its history it has to carry them on
 FLUSH_NS = 50_000_000  # what a crash of the machine may cost
 STATE_NS = 100_000_000
-MAX_CAMERAS = 8  # an open bus must not fill the file with channels
+MAX_CAMERA_TOPICS = 16  # topics, two for each camera: an open bus must not fill the file with channels
 MAX_TAKE = 1000  # messages of one key in one poll: a flood must not keep the cycles waiting
 ORPHAN_NS = 1_000_000_000  # without a supervisor and without new cycles for this long, the session is over
 
@@ -47,6 +48,10 @@ BUS_CHANNELS = (
     (topics.CONTROL, schema.CONTROL),
     (topics.PLANT_TRUTH, schema.TRUTH),
 )
+
+
+_WIRES = {"rx": schema.WIRE_RX, "tx": schema.WIRE_TX}
+_STAMP = struct.Struct("<q")
 
 
 class Logger:
@@ -69,13 +74,18 @@ class Logger:
         self._cycles, self._wire, self._display = cycles, wire, display
         self._t_offset = layout.dtype.fields["inputs.t_ns"][1]  # type: ignore[index]
         self._inboxes: list[tuple[Latest | Queue, schema.Channel]] = []
-        self._images: Queue | None = None
-        self._cameras: set[str] = set()
+        self._eyes: list[tuple[Queue, Callable[[bytes], schema.Channel | None]]] = []
+        self._cameras: set[str] = set()  # topics of theirs
         self._state: Publisher | None = None
+        self._joints: Publisher | None = None
         if bus is not None:
             self._inboxes = [(bus.queue(topic.key), channel) for topic, channel in BUS_CHANNELS]
-            self._images = bus.queue(topics.CAMERA.key)
+            self._eyes = [
+                (bus.queue(topics.CAMERA_CALIBRATION.key), schema.camera_calibration),
+                (bus.queue(topics.CAMERA.key), schema.camera),
+            ]
             self._state = bus.publisher(topics.STATE.key)
+            self._joints = bus.publisher(topics.JOINTS.key)
         self._lost = {"cycle": 0, "wire": 0}
         self._newest: bytes | None = None
         self._next_flush_ns = self._next_state_ns = self.last_cycle_ns = clock()
@@ -118,7 +128,8 @@ class Logger:
         self._take_cycles()
         self._take_wire()
         self._take_bus()
-        self._take_images()
+        for inbox, channel_of in self._eyes:
+            self._take_camera(inbox, channel_of)
         self._count_losses()
         if now_ns >= self._next_flush_ns and self.failure is None:
             self._log.flush()
@@ -141,30 +152,35 @@ class Logger:
             self._log.log.abandon()
 
     def _take_cycles(self) -> None:
-        for payload in self._cycles.drain():
-            self.last_cycle_ns = self._clock()
+        while payloads := self._cycles.drain():
+            self.last_cycle_ns, self._newest = self._clock(), payloads[-1]
+            if self._joints is not None and (joints := joints_message(self._layout, payloads)):
+                self._joints.put_json(joints)
             if self.failure is not None:
-                self._newest = payload
-                self.unrecorded += 1
+                self.unrecorded += len(payloads)
                 continue
-            buffer = bytearray(payload)
-            self._layout.seal(buffer)
-            self._newest = record = bytes(buffer)
-            self.records += 1
-            self._unsafe += 1
-            t_ns = int.from_bytes(record[self._t_offset : self._t_offset + 8], "little", signed=True)
-            self._log.message(schema.CYCLE, t_ns, record)
+            self.records += len(payloads)
+            self._unsafe += len(payloads)
+            times = [_STAMP.unpack_from(payload, self._t_offset)[0] for payload in payloads]
+            self._log.messages(schema.CYCLE, times, [self._layout.sealed(payload) for payload in payloads])
             if self._display is not None:
-                self._display.cycle(self._log.log, t_ns, record)
+                for t_ns, payload in zip(times, payloads, strict=True):
+                    self._display.cycle(self._log.log, t_ns, payload)
 
     def _take_wire(self) -> None:
         if self._wire is None:
             return
-        for payload in self._wire.drain():
-            if self.failure is None:
-                direction, t_ns, length, data = ring.parse_wire(payload)
-                channel = schema.WIRE_RX if direction == "rx" else schema.WIRE_TX
-                self._log.message(channel, t_ns, schema.wire_message(t_ns, length, data))
+        while payloads := self._wire.drain():
+            if self.failure is not None:
+                continue
+            passed: dict[str, tuple[list[int], list[bytes]]] = {direction: ([], []) for direction in _WIRES}
+            for direction, t_ns, length, data in map(ring.parse_wire, payloads):
+                times, packets = passed[direction]
+                times.append(t_ns)
+                packets.append(schema.wire_message(t_ns, length, data))
+            for direction, (times, packets) in passed.items():
+                if packets:
+                    self._log.messages(_WIRES[direction], times, packets)
 
     def _take_bus(self) -> None:
         for inbox, channel in self._inboxes:
@@ -176,14 +192,14 @@ class Logger:
                     if channel is schema.CONTROL:
                         self._keep_decided(data)
 
-    def _take_images(self) -> None:
+    def _take_camera(self, inbox: Queue, channel_of: Callable[[bytes], schema.Channel | None]) -> None:
         for _ in range(MAX_TAKE):
-            if self._images is None or (data := self._images.take()) is None:
+            if (data := inbox.take()) is None:
                 return
-            channel = schema.camera(data)
+            channel = channel_of(data)
             if channel is None or self.failure is not None:
                 continue
-            if channel.topic in self._cameras or len(self._cameras) < MAX_CAMERAS:
+            if channel.topic in self._cameras or len(self._cameras) < MAX_CAMERA_TOPICS:
                 self._cameras.add(channel.topic)
                 self._log.message(channel, self._clock(), data)
 
@@ -218,17 +234,30 @@ class Logger:
             self._state.put_json(state_message(self._layout, self._newest, self.dropped))
 
 
+def joints_message(layout: RecordLayout, records: list[bytes]) -> dict[str, Any]:
+    """The samples of these cycles, for who has to know where the arm was at a capture; {}: the robot said nothing."""
+    rows = np.frombuffer(b"".join(records), layout.dtype)
+    rows = rows[rows["inputs.joint.present"] == 1]
+    if not len(rows):
+        return {}
+    return {"t_ns": rows["inputs.joint.t_rx_ns"].tolist(), "q": rows["inputs.joint.q"].tolist()}
+
+
 def state_message(layout: RecordLayout, record: bytes, dropped: int) -> dict[str, Any]:
-    """What the newest cycle says to the slow world; `d_min_now` in m, None: nobody near."""
+    """What the newest cycle says to the slow world; `d_min_now` in m, None: nobody near. `d_goal`: the same of the arm
+    at its goal; under safety.d_min_m it waits until the person makes way."""
     row = np.frombuffer(record, layout.dtype)[0]
-    distance = float(row["outputs.decision.d_measured"])
+    distance, at_goal = float(row["outputs.decision.d_measured"]), float(row["outputs.decision.d_goal"])
     return {
         "tick": int(row["inputs.tick"]),
         "mode": Mode(int(row["state.mode"])).name,
         "reason": StopReason(int(row["outputs.decision.reason"])).name,
         "goal_id": int(row["state.goal.id"]),
         "reached_id": int(row["state.reached_id"]),
+        "q_cmd": row["state.q_cmd"].tolist(),
+        "dq_cmd": row["state.dq_cmd"].tolist(),
         "d_min_now": distance if math.isfinite(distance) else None,
+        "d_goal": at_goal if math.isfinite(at_goal) else None,
         "dropped": dropped,
     }
 

@@ -6,7 +6,9 @@ import sys
 
 from asc_rt import realtime
 
-USAGE = "usage: python -m sim_hil {fanuc CELL | human CELL | trials SUITE} [options]"
+DEVICES = "fanuc CELL | can CELL | human CELL | camera CELL | mount CELL | changer CELL TOOL ... | swaps LOG"
+DEVICES += " | trials SUITE | seeing"
+USAGE = f"usage: python -m sim_hil {{{DEVICES}}} [options]"
 
 
 def main(argv: list[str]) -> int:
@@ -16,10 +18,36 @@ def main(argv: list[str]) -> int:
             from sim_hil.fanuc import server
 
             return server.main(rest)
+        case ["can", *rest]:
+            realtime.one_blas_thread()
+            from sim_hil.can import server as can_server
+
+            return can_server.main(rest)
         case ["human", cell, *rest]:
             from sim_hil import human
 
             return human.main(cell, rest)
+        case ["camera", *rest]:
+            realtime.one_blas_thread()
+            from sim_hil import camera
+
+            return camera.main(rest)
+        case ["mount", *rest]:
+            from sim_hil import mount
+
+            return mount.main(rest)
+        case ["changer", *rest]:
+            from sim_hil import changer
+
+            return changer.main(rest)
+        case ["swaps", *rest]:
+            from sim_hil import swap_picture
+
+            return swap_picture.main(rest)
+        case ["seeing", *rest]:
+            from sim_hil import seeing
+
+            return seeing.main(rest)
         case ["trials", *rest]:
             from sim_hil.trials import main as trials
 

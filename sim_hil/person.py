@@ -38,9 +38,17 @@ ARM_REACH = 0.66  # m, shoulder to hand: never quite straight
 PEAK = 1.875  # largest slope of the minimum-jerk profile
 STEP = 1e-30  # of the complex step
 
-# The posture: distance and azimuth of the body, heading against "towards the robot", lean, hands in the body frame
-RHO, AZIMUTH, HEADING, LEAN, HANDS = 0, 1, 2, 3, slice(4, 10)
-CHANNELS: dict[str, int | slice] = {"rho": RHO, "azimuth": AZIMUTH, "heading": HEADING, "lean": LEAN, "hands": HANDS}
+# The posture: distance and azimuth of the body, heading against "towards the robot", lean, hands in the body frame,
+# how far the hips are lowered
+RHO, AZIMUTH, HEADING, LEAN, HANDS, CROUCH = 0, 1, 2, 3, slice(4, 10), 10
+CHANNELS: dict[str, int | slice] = {
+    "rho": RHO,
+    "azimuth": AZIMUTH,
+    "heading": HEADING,
+    "lean": LEAN,
+    "hands": HANDS,
+    "crouch": CROUCH,
+}
 REST_HANDS = np.array([0.20, 0.24, 0.22, 0.20, -0.24, 0.22])  # m, left and right: x forward, y left, z above the base
 
 
@@ -73,7 +81,7 @@ class Person:
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         azimuth, heading = self._rng.uniform(-1.2, 1.2), self._rng.uniform(-0.6, 0.6)
-        self._posture = np.concatenate([[OUTSIDE, azimuth, heading, 0.0], REST_HANDS])
+        self._posture = np.concatenate([[OUTSIDE, azimuth, heading, 0.0], REST_HANDS, [0.0]])
         self._phases: list[Phase] = []
         self._starts: list[float] = []
         self._end = 0.0
@@ -158,7 +166,7 @@ def _gait(phase: Phase, tau: complex, share: complex) -> tuple[complex, complex]
 def _capsule_ends(posture: Numbers, gait: tuple[complex, complex]) -> tuple[Numbers, Numbers]:
     size, angle = gait
     forward, lean = np.array([1.0, 0.0, 0.0]), posture[LEAN]
-    hips = np.array([0.0, 0.0, HIP_Z])
+    hips = np.array([0.0, 0.0, 1.0]) * (HIP_Z - posture[CROUCH])
     spine = np.array([np.sin(lean), 0.0, np.cos(lean)])
     neck = hips + TORSO * spine
     segments: list[tuple[Numbers, Numbers]] = [(hips, neck), (neck + HEAD[0] * spine, neck + HEAD[1] * spine)]

@@ -11,6 +11,9 @@ Units: SI, radians; robot base frame.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,11 +26,15 @@ from asc_rt.core.types import MAX_CAPSULES
 from sim_hil.person import FLOOR_Z, Capsules
 
 Array = npt.NDArray[np.float64]
+Three = tuple[float, float, float]
+Wall = tuple[Three, Three]  # centre and half sizes of a box, m
 
 SUBSTEP = 0.001  # s
 SERVO_BANDWIDTH = 120.0  # rad/s, ASSUMED: far above what a robot controller's set-points contain
 ROTOR_INERTIA = 1e-3  # kg m2 at the joint per Nm of effort, ASSUMED: not published, the size of a geared servo motor's.
 # Position-controlled arms only: the identified inertias of a torque-controlled one include what its motors add.
+BRAKE_SHARE = 2.0  # holding torque of a joint's brake, share of the effort, ASSUMED
+BRAKE_STIFF = (0.002, 1.0, 0.99999)  # time constant s, damping, impedance: a closed brake must not creep
 PARKED = np.array([0.0, 0.0, -1000.0])  # m, where unused capsules of the person wait
 NO_FORCE = 1e3  # m: contacts are found at 0 (margin + gap) and push only when this deep (margin)
 FAR = 1e3  # m, beyond this MuJoCo need not look
@@ -61,18 +68,45 @@ class MujocoPlant:
     """
 
     def __init__(self, params: Params, q0: npt.ArrayLike | None = None) -> None:
-        self._model = _build(params)
+        self._params = params
+        self._take(self._built(params))
         names = [self._model.joint(i).name for i in range(self._model.njnt)]
         if names != list(params.robot.joints) or self._model.nv != params.n:
             raise ValueError(f"joints of the URDF are {names}, of the profile {list(params.robot.joints)}")
-        self._data = mujoco.MjData(self._model)
-        self._substeps = max(1, round(params.period / SUBSTEP))
-        self._model.opt.timestep = params.period / self._substeps
         self._period = params.period
+        self._model.dof_solref[:] = BRAKE_STIFF[:2]
+        self._model.dof_solimp[:, :2] = BRAKE_STIFF[2]
+        self._brake = BRAKE_SHARE * self._model.jnt_actfrcrange[:, 1]
         self._fastest = np.array(params.robot.dq_max)
+        self.reset(np.zeros(params.n) if q0 is None else q0)
+
+    def _built(self, params: Params) -> Any:
+        return build(params)
+
+    def _take(self, model: Any) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
+        self._substeps = max(1, round(self._params.period / SUBSTEP))
+        model.opt.timestep = self._params.period / self._substeps
         self._robot_geoms = [g for g in range(self._model.ngeom) if self._model.geom(g).name.startswith("robot/")]
         self._person_geoms = [self._model.geom(f"person/{i}").id for i in range(MAX_CAPSULES)]
-        self.reset(np.zeros(params.n) if q0 is None else q0)
+        self._robot, self._persons = np.array(self._robot_geoms), np.array(self._person_geoms)
+        self._carried = self._robot[-max(1, len(self._params.tool.capsules)) :]
+
+    def carry(self, tool: ToolParams) -> None:
+        """Another tool from now on, shape and mass; the arm goes on as it moves, people stay where they are."""
+        before, size, bound = self._data, self._model.geom_size, self._model.geom_rbound
+        people = size[self._person_geoms], bound[self._person_geoms]
+        self._params = dataclasses.replace(self._params, tool=tool)
+        self._take(self._built(self._params))
+        self._model.geom_size[self._person_geoms], self._model.geom_rbound[self._person_geoms] = people
+        for name in ("time", "qpos", "qvel", "ctrl", "mocap_pos", "mocap_quat"):
+            setattr(self._data, name, getattr(before, name))
+        mujoco.mj_step1(self._model, self._data)
+
+    @property
+    def tool(self) -> str:
+        """Name of what it carries."""
+        return self._params.tool.name
 
     @property
     def q(self) -> Array:
@@ -117,6 +151,10 @@ class MujocoPlant:
             raise ValueError(f"torque {torque.tolist()}: {len(self._target)} finite torques are needed")
         self._torque = torque
 
+    def set_brakes(self, closed: npt.ArrayLike) -> None:
+        """Joints whose brake is closed, (n,) bool: dry friction that no motor of the arm overcomes."""
+        self._model.dof_frictionloss[:] = np.where(closed, self._brake, 0.0)
+
     def step(self) -> None:
         """One control period: the servo follows a straight line from the last target to the new one."""
         model, data = self._model, self._data
@@ -158,25 +196,54 @@ class MujocoPlant:
         self._labels = tuple(person.labels)
         mujoco.mj_step1(self._model, self._data)
 
-    def distance(self) -> Nearest:
-        """Smallest distance of all robot-person pairs, now."""
+    def distance(self, approach_within: float = np.inf) -> Nearest:
+        """Smallest distance of all robot-person pairs, now. Its `approach` is worked out nearer than `approach_within`
+        only, else zero."""
+        return self._nearest(self._robot, approach_within)
+
+    def tool_distance(self, nearest: Nearest | None = None) -> float:
+        """From what it carries, or from the arm's last capsule where that is nothing, to the nearest person, m;
+        `nearest`: of the whole arm, now, if it is known."""
+        if nearest is not None and nearest.robot_part in [self._part(int(geom)) for geom in self._carried]:
+            return nearest.distance
+        return self._nearest(self._carried).distance
+
+    def _nearest(self, robot: npt.NDArray[np.int64], approach_within: float = 0.0) -> Nearest:
         if not self._labels:
             return NOBODY
         model, data = self._model, self._data
-        robot, person = np.array(self._robot_geoms), np.array(self._person_geoms[: len(self._labels)])
-        centre, bound = data.geom_xpos, model.geom_rbound
-        apart = np.linalg.norm(centre[robot][:, None] - centre[person][None], axis=2)
-        at_least = (apart - bound[robot][:, None] - bound[person][None]).ravel()
+        person = self._persons[: len(self._labels)]
+        apart = data.geom_xpos[robot][:, None] - data.geom_xpos[person][None]
+        bound = model.geom_rbound
+        centres = np.sqrt(np.einsum("rpx,rpx->rp", apart, apart))
+        at_least = (centres - bound[robot][:, None] - bound[person][None]).ravel()
         best, pair, points = FAR, (0, 0), np.zeros((6, 1))
+        ends = np.zeros((6, 1))
         for index in np.argsort(at_least):  # spheres around the capsules: most pairs need no closer look
             if at_least[index] >= best:
                 break
-            candidate, ends = divmod(int(index), len(person)), np.zeros((6, 1))
+            candidate = divmod(int(index), len(person))
             d = mujoco.mj_geomDistance(model, data, robot[candidate[0]], person[candidate[1]], FAR, ends)
             if d < best:
-                best, pair, points = d, candidate, ends
-        approach = self._approach(int(robot[pair[0]]), points[:3, 0], points[3:, 0], best)
+                best, pair, points = d, candidate, ends.copy()
+        approach = 0.0
+        if best < approach_within:
+            approach = self._approach(int(robot[pair[0]]), points[:3, 0], points[3:, 0], best)
         return Nearest(best, self._part(int(robot[pair[0]])), self._labels[pair[1]], approach)
+
+    def truth(self, t_ns: int) -> dict[str, Any]:
+        """What the arm did and how near somebody is, as told to the record; `t_ns`: monotonic time of this period."""
+        nearest = self.distance()
+        return {
+            "t_ns": t_ns,
+            "q": self.q.tolist(),
+            "dq": self.dq.tolist(),
+            "distance_m": nearest.distance if np.isfinite(nearest.distance) else None,
+            "robot_part": nearest.robot_part,
+            "person_part": nearest.person_part,
+            "approach_m_s": nearest.approach,
+            "contact": bool(self.contacts),
+        }
 
     def _approach(self, geom: int, at: Array, towards: Array, distance: float) -> float:
         line = (towards - at) * np.sign(distance)  # inside each other, the points change sides
@@ -197,13 +264,18 @@ class MujocoPlant:
         return str(self._model.geom(geom).name).split("/")[1]
 
 
-def _build(params: Params) -> Any:
+@functools.lru_cache(maxsize=16)  # a swap takes no longer than a step
+def _spec(params: Params, walls: tuple[Wall, ...] = ()) -> Any:
     spec = mujoco.MjSpec.from_string(params.robot.urdf)
     spec.compiler.fusestatic = False  # keeps base and flange as bodies
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a diverged run must not look like a fresh one
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     floor = spec.worldbody.add_geom(name="floor", pos=[0, 0, FLOOR_Z], size=[5, 5, 0.1], contype=0, conaffinity=0)
     floor.type = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.compiler.discardvisual = not walls  # what collides with nothing is left out, unless it is to be seen
+    for i, (pos, size) in enumerate(walls):
+        wall = spec.worldbody.add_geom(name=f"wall{i}", pos=pos, size=size, contype=0, conaffinity=0)
+        wall.type = mujoco.mjtGeom.mjGEOM_BOX
     counts: dict[str, int] = {}
     for capsule in params.robot.capsules:
         i = counts[capsule.link] = counts.get(capsule.link, -1) + 1
@@ -225,6 +297,10 @@ def _build(params: Params) -> Any:
         if params.control != "torque":
             joint.armature = ROTOR_INERTIA * joint.actfrcrange[1]  # the URDF's effort
     return spec.compile()
+
+
+def build(params: Params, walls: tuple[Wall, ...] = ()) -> Any:
+    return copy.copy(_spec(params, walls))  # sizes of people are written into it
 
 
 def _add_capsule(body: Any, name: str, capsule: CapsuleSpec) -> None:

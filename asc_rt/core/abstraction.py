@@ -27,20 +27,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from asc_rt.core.kinematics import Chain, Motion, cross, forward
-from asc_rt.core.polytope import greatest
-from asc_rt.core.realizable import control_set
-from asc_rt.core.robot_model import Arm, Capsules
-from asc_rt.core.types import Vector
+from asc_rt.core.kinematics import Chain, Motion, Three, cross, dot, forward, plus, rotated
+from asc_rt.core.robot_model import Capsules
+from asc_rt.core.types import IntVector, Vector
 
 # ASSUMED: below this the direction of separation is numerical noise; the pair counts as touching.
 MIN_AXIS_DISTANCE = 1e-6
-# ASSUMED: difference step for M_dot, s. Central difference: error O(step^2); checked against a ten times larger step.
-DIFFERENCE_STEP = 1e-5
-# ASSUMED: m/s3. A steeper one-sided difference is no slope but a jump of M (a nearest point arriving at a segment's end
-# switches its slip term): it is in M itself from the next cycle on, and as a slope it would only stop the robot for
-# nothing.
-JUMP = 1e4
+ROUNDING = 1e-9  # m, of a distance within 1e5 m
 
 
 class People(NamedTuple):
@@ -68,7 +61,7 @@ class Separation(NamedTuple):
 
 
 @njit(cache=True)
-def _nearest(p0: Vector, p1: Vector, q0: Vector, q1: Vector) -> tuple[float, float]:
+def nearest(p0: Three, p1: Three, q0: Three, q1: Three) -> tuple[float, float]:
     """Parameters (s, t) in [0, 1] of the nearest points of two segments; a segment may be a point."""
     a = e = b = c = f = 0.0
     for k in range(3):
@@ -94,25 +87,11 @@ def _nearest(p0: Vector, p1: Vector, q0: Vector, q1: Vector) -> tuple[float, flo
 
 
 @njit(cache=True)
-def _slip(
-    s: float,
-    t: float,
-    w: Vector,
-    rate: Vector,
-    e_r: Vector,
-    e_h: Vector,
-    w_r: Vector,
-    de_h: Vector,
-) -> float:
-    """b^T A^-1 b over the free parameters; w_r: angular velocity of the robot capsule, de_h: rate of e_h."""
-    de_r = cross(w_r, e_r)
-    b_s = b_t = rr = hh = rh = 0.0
-    for k in range(3):
-        b_s += e_r[k] * rate[k] + w[k] * de_r[k]
-        b_t -= e_h[k] * rate[k] + w[k] * de_h[k]
-        rr += e_r[k] * e_r[k]
-        hh += e_h[k] * e_h[k]
-        rh += e_r[k] * e_h[k]
+def _slip(s: float, t: float, w: Three, rate: Three, e_r: Three, e_h: Three, de_r: Three, de_h: Three) -> float:
+    """b^T A^-1 b over the free parameters; de_r, de_h: rates of e_r, e_h."""
+    b_s = dot(e_r, rate) + dot(w, de_r)
+    b_t = -dot(e_h, rate) - dot(w, de_h)
+    rr, hh, rh = dot(e_r, e_r), dot(e_h, e_h), dot(e_r, e_h)
     s_free = 0.0 < s < 1.0 and rr > 1e-12
     t_free = 0.0 < t < 1.0 and hh > 1e-12
     det = rr * hh - rh * rh
@@ -125,110 +104,126 @@ def _slip(
 
 
 @njit(cache=True)
-def _place(motion: Motion, joint: int, local: Vector, out: Vector) -> None:
-    for k in range(3):
-        if joint < 0:
-            out[k] = local[k]
-        else:
-            rotation = motion.rotation[joint]
-            out[k] = (
-                motion.origin[joint, k]
-                + rotation[k, 0] * local[0]
-                + rotation[k, 1] * local[1]
-                + rotation[k, 2] * local[2]
-            )
+def place(motion: Motion, joint: int, local: Three) -> tuple[float, float, float]:
+    """World position of a point fixed to the link of `joint`; -1: to the base."""
+    if joint < 0:
+        return local[0], local[1], local[2]
+    return plus(motion.origin[joint], 1.0, rotated(motion.rotation[joint], local))
 
 
 @njit(cache=True)
-def _pair(
+def pair(
     motion: Motion,
     joint: int,
-    r0: Vector,
-    r1: Vector,
-    radius: float,
+    r0: Three,
+    r1: Three,
     people: People,
     h: int,
     human_acceleration: float,
     C: Vector,
-) -> tuple[float, float, float, float, float]:
-    """(d, d_dot, drift, d_dot_robot, drift_robot) of one pair; C is filled in. World end points r0, r1 of the
-    robot's."""
+) -> tuple[float, float, float, float]:
+    """(d_dot, drift, d_dot_robot, drift_robot) of one pair; C is filled in. World end points r0, r1 of the robot's."""
     h0, h1 = people.p0[h], people.p1[h]
-    s, t = _nearest(r0, r1, h0, h1)
-    w, e_r, e_h, de_h = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    v_r, v_h, bias, omega = np.zeros(3), np.empty(3), np.zeros(3), np.zeros(3)
-    point = np.empty(3)
-    squared = 0.0
-    for k in range(3):
-        e_r[k], e_h[k] = r1[k] - r0[k], h1[k] - h0[k]
-        de_h[k] = people.v1[h, k] - people.v0[h, k]
-        point[k] = r0[k] + s * e_r[k]
-        v_h[k] = people.v0[h, k] + t * de_h[k]
-        w[k] = point[k] - h0[k] - t * e_h[k]
-        squared += w[k] * w[k]
-    D = max(np.sqrt(squared), MIN_AXIS_DISTANCE)
+    v0 = people.v0[h]
+    s, t = nearest(r0, r1, h0, h1)
+    e_r, e_h, de_h = plus(r1, -1.0, r0), plus(h1, -1.0, h0), plus(people.v1[h], -1.0, v0)
+    point = plus(r0, s, e_r)
+    w = plus(plus(point, -1.0, h0), -t, e_h)
+    D = max(np.sqrt(dot(w, w)), MIN_AXIS_DISTANCE)
+    v_r = bias = de_r = (0.0, 0.0, 0.0)
     if joint >= 0:
-        arm = point - motion.origin[joint]
         omega = motion.omega[joint]
-        wr = np.array(cross(omega, arm))
-        wwr = cross(omega, wr)
-        ar = cross(motion.alpha[joint], arm)
-        for k in range(3):
-            v_r[k] = motion.velocity[joint, k] + wr[k]
-            bias[k] = motion.acceleration[joint, k] + ar[k] + wwr[k]
+        arm = plus(point, -1.0, motion.origin[joint])
+        turn = cross(omega, arm)
+        v_r = plus(motion.velocity[joint], 1.0, turn)
+        bias = plus(motion.acceleration[joint], 1.0, cross(motion.alpha[joint], arm))
+        bias = plus(bias, 1.0, cross(omega, turn))
+        de_r = cross(omega, e_r)
     for i in range(C.shape[0]):
-        C[i] = 0.0
-        if i <= joint:
-            column = cross(motion.axis[i], point - motion.origin[i])
-            C[i] = (w[0] * column[0] + w[1] * column[1] + w[2] * column[2]) / D
-    rate = v_r - v_h
-    d_dot = (w[0] * rate[0] + w[1] * rate[1] + w[2] * rate[2]) / D
-    d_dot_robot = (w[0] * v_r[0] + w[1] * v_r[1] + w[2] * v_r[2]) / D
-    along = (w[0] * bias[0] + w[1] * bias[1] + w[2] * bias[2]) / D
-    square = rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2]
-    square_robot = v_r[0] * v_r[0] + v_r[1] * v_r[1] + v_r[2] * v_r[2]
-    slip = _slip(s, t, w, rate, e_r, e_h, omega, de_h)
-    slip_robot = _slip(s, t, w, v_r, e_r, e_h, omega, np.zeros(3))
-    drift = along + (square - d_dot * d_dot - slip) / D - human_acceleration
-    drift_robot = along + (square_robot - d_dot_robot * d_dot_robot - slip_robot) / D
-    return (
-        D - radius - people.radius[h],
-        d_dot - people.velocity_bound[h],
-        drift,
-        d_dot_robot,
-        drift_robot,
-    )
+        C[i] = dot(w, cross(motion.axis[i], plus(point, -1.0, motion.origin[i]))) / D if i <= joint else 0.0
+    rate = plus(plus(v_r, -1.0, v0), -t, de_h)
+    d_dot, d_dot_robot, along = dot(w, rate) / D, dot(w, v_r) / D, dot(w, bias) / D
+    slip = _slip(s, t, w, rate, e_r, e_h, de_r, de_h)
+    slip_robot = _slip(s, t, w, v_r, e_r, e_h, de_r, (0.0, 0.0, 0.0))
+    drift = along + (dot(rate, rate) - d_dot * d_dot - slip) / D - human_acceleration
+    drift_robot = along + (dot(v_r, v_r) - d_dot_robot * d_dot_robot - slip_robot) / D
+    return d_dot - people.velocity_bound[h], drift, d_dot_robot, drift_robot
 
 
 @njit(cache=True)
-def _distance(r0: Vector, r1: Vector, radius: float, people: People, h: int) -> float:
-    """d of one pair alone, to the bit as `_pair` has it, m."""
+def distance(r0: Three, r1: Three, radius: float, people: People, h: int) -> float:
+    """d of one pair, m."""
     h0, h1 = people.p0[h], people.p1[h]
-    s, t = _nearest(r0, r1, h0, h1)
-    squared = 0.0
-    for k in range(3):
-        w = r0[k] + s * (r1[k] - r0[k]) - h0[k] - t * (h1[k] - h0[k])
-        squared += w * w
-    d: float = max(np.sqrt(squared), MIN_AXIS_DISTANCE) - radius - people.radius[h]
+    s, t = nearest(r0, r1, h0, h1)
+    w = plus(plus(r0, s, plus(r1, -1.0, r0)), -1.0, plus(h0, t, plus(h1, -1.0, h0)))
+    d: float = max(np.sqrt(dot(w, w)), MIN_AXIS_DISTANCE) - radius - people.radius[h]
     return d
+
+
+@njit(cache=True)
+def _at_least(r0: Three, r1: Three, radius: float, people: People, h: int) -> float:
+    """A lower bound on `distance` at a fraction of its cost, m: the spheres around both capsules."""
+    h0, h1 = people.p0[h], people.p1[h]
+    apart = plus(plus(r0, 1.0, r1), -1.0, plus(h0, 1.0, h1))
+    e_r, e_h = plus(r1, -1.0, r0), plus(h1, -1.0, h0)
+    halves = np.sqrt(dot(e_r, e_r)) + np.sqrt(dot(e_h, e_h))
+    least: float = 0.5 * (np.sqrt(dot(apart, apart)) - halves) - radius - people.radius[h] - ROUNDING
+    return least
 
 
 @njit(cache=True)
 def least_distance(chain: Chain, capsules: Capsules, people: People, q: Vector) -> float:
     """Smallest d of all pairs of a moving robot capsule and a human capsule, m; inf without a pair, nan if one is."""
     motion = forward(chain, q, np.zeros(q.shape[0]))
-    least, r0, r1 = np.inf, np.empty(3), np.empty(3)
+    least = np.inf
     for i in range(capsules.joint.shape[0]):
-        if capsules.joint[i] < 0:
+        joint = capsules.joint[i]
+        if joint < 0:
             continue
-        _place(motion, capsules.joint[i], capsules.p0[i], r0)
-        _place(motion, capsules.joint[i], capsules.p1[i], r1)
+        r0, r1 = place(motion, joint, capsules.p0[i]), place(motion, joint, capsules.p1[i])
         for h in range(people.p0.shape[0]):
-            d = _distance(r0, r1, capsules.radius[i], people, h)
+            if _at_least(r0, r1, capsules.radius[i], people, h) > least:
+                continue
+            d = distance(r0, r1, capsules.radius[i], people, h)
             if np.isnan(d):
                 return np.nan
             least = min(least, d)
     return least
+
+
+@njit(cache=True)
+def separation_at(
+    motion: Motion, capsules: Capsules, people: People, reach: float, human_acceleration: float
+) -> Separation:
+    """All pairs of a *moving* robot capsule and a human capsule nearer than `reach`. What no joint moves has no row.
+
+    Distances come first: a pair out of reach costs no more than its distance. In the order of the capsules.
+    """
+    m, h_count, n = capsules.joint.shape[0], people.p0.shape[0], motion.origin.shape[0]
+    robot, human = np.empty(m * h_count, np.int64), np.empty(m * h_count, np.int64)
+    d = np.empty(m * h_count)
+    count = 0
+    for i in range(m):
+        joint = capsules.joint[i]
+        if joint < 0:
+            continue
+        r0, r1 = place(motion, joint, capsules.p0[i]), place(motion, joint, capsules.p1[i])
+        for h in range(h_count):
+            if _at_least(r0, r1, capsules.radius[i], people, h) >= reach:
+                continue
+            d[count] = distance(r0, r1, capsules.radius[i], people, h)
+            if d[count] >= reach:
+                continue  # not so for a distance that is not a number: that one is near
+            robot[count], human[count] = i, h
+            count += 1
+    values, C = np.empty((4, count)), np.empty((count, n))
+    for p in range(count):
+        i = robot[p]
+        joint = capsules.joint[i]
+        r0, r1 = place(motion, joint, capsules.p0[i]), place(motion, joint, capsules.p1[i])
+        d_dot, drift, d_dot_robot, drift_robot = pair(motion, joint, r0, r1, people, human[p], human_acceleration, C[p])
+        values[0, p], values[1, p], values[2, p], values[3, p] = d_dot, drift, d_dot_robot, drift_robot
+    return Separation(robot[:count], human[:count], d[:count], values[0], C, values[1], values[2], values[3])
 
 
 @njit(cache=True)
@@ -241,105 +236,26 @@ def separation(
     reach: float,
     human_acceleration: float,
 ) -> Separation:
-    """All pairs of a *moving* robot capsule and a human capsule nearer than `reach`. What no joint moves has no row."""
-    motion = forward(chain, q, dq)
-    m, h_count, n = capsules.joint.shape[0], people.p0.shape[0], q.shape[0]
-    total = m * h_count
-    robot, human = np.empty(total, np.int64), np.empty(total, np.int64)
-    values = np.empty((5, total))
-    C = np.empty((total, n))
-    r0, r1 = np.empty(3), np.empty(3)
-    count = 0
-    for i in range(m):
-        joint = capsules.joint[i]
-        if joint < 0:
-            continue
-        _place(motion, joint, capsules.p0[i], r0)
-        _place(motion, joint, capsules.p1[i], r1)
-        for h in range(h_count):
-            if _distance(r0, r1, capsules.radius[i], people, h) >= reach:
-                continue  # not so for a distance that is not a number: that one is near
-            d, d_dot, drift, d_dot_robot, drift_robot = _pair(
-                motion,
-                joint,
-                r0,
-                r1,
-                capsules.radius[i],
-                people,
-                h,
-                human_acceleration,
-                C[count],
-            )
-            robot[count], human[count] = i, h
-            values[0, count], values[1, count], values[2, count] = d, d_dot, drift
-            values[3, count], values[4, count] = d_dot_robot, drift_robot
-            count += 1
+    """`separation_at` of a state (q, dq)."""
+    return separation_at(forward(chain, q, dq), capsules, people, reach, human_acceleration)
+
+
+@njit(cache=True)
+def nearest_first(found: Separation) -> Separation:
+    """The pairs in the order of their distance, equal ones as they came; not-a-numbers last."""
+    return picked(found, np.argsort(found.d, kind="mergesort"))
+
+
+@njit(cache=True)
+def picked(found: Separation, order: IntVector) -> Separation:
+    """These of the pairs."""
     return Separation(
-        robot[:count],
-        human[:count],
-        values[0, :count],
-        values[1, :count],
-        C[:count],
-        values[2, :count],
-        values[3, :count],
-        values[4, :count],
+        found.robot[order],
+        found.human[order],
+        found.d[order],
+        found.d_dot[order],
+        found.C[order],
+        found.drift[order],
+        found.d_dot_robot[order],
+        found.drift_robot[order],
     )
-
-
-@njit(cache=True)
-def _radii_at(
-    arm: Arm,
-    people: People,
-    q: Vector,
-    dq: Vector,
-    ddq: Vector,
-    human_acceleration: float,
-    pairs: Separation,
-    shift: float,
-) -> Vector:
-    """M of the given pairs at the state `shift` seconds along (dq, ddq) and the people's velocities."""
-    q_s, dq_s = q + shift * dq, dq + shift * ddq
-    moved = People(
-        people.p0 + shift * people.v0,
-        people.p1 + shift * people.v1,
-        people.v0,
-        people.v1,
-        people.radius,
-        people.velocity_bound,
-    )
-    motion = forward(arm.chain, q_s, dq_s)
-    U = control_set(arm, motion, q_s, dq_s)
-    out = np.empty(pairs.d.shape[0])
-    C, r0, r1 = np.empty(q.shape[0]), np.empty(3), np.empty(3)
-    for i in range(out.shape[0]):
-        c = pairs.robot[i]
-        joint = arm.capsules.joint[c]
-        _place(motion, joint, arm.capsules.p0[c], r0)
-        _place(motion, joint, arm.capsules.p1[c], r1)
-        drift = _pair(motion, joint, r0, r1, arm.capsules.radius[c], moved, pairs.human[i], human_acceleration, C)[2]
-        out[i] = drift + greatest(C, U)
-    return out
-
-
-@njit(cache=True)
-def radii(
-    arm: Arm, people: People, q: Vector, dq: Vector, ddq: Vector, human_acceleration: float, pairs: Separation
-) -> tuple[Vector, Vector]:
-    """M and M_dot = dM/dx . x_dot of every pair, x = (q, dq, people), x_dot = (dq, ddq, people's velocities).
-
-    M has kinks (a C_i changes sign, a joint enters its braking zone, a nearest point reaches a segment's end), so the
-    difference is numeric and two-sided; of its left and right halves the smaller one counts: M falling is what harms.
-    """
-    h = DIFFERENCE_STEP
-    here = _radii_at(arm, people, q, dq, ddq, human_acceleration, pairs, 0.0)
-    ahead = _radii_at(arm, people, q, dq, ddq, human_acceleration, pairs, h)
-    behind = _radii_at(arm, people, q, dq, ddq, human_acceleration, pairs, -h)
-    slope = np.empty(here.shape[0])
-    for i in range(here.shape[0]):
-        right, left = (ahead[i] - here[i]) / h, (here[i] - behind[i]) / h
-        if abs(right) > JUMP:
-            right = left
-        if abs(left) > JUMP:
-            left = right
-        slope[i] = min(left, right) if abs(left) <= JUMP else 0.0
-    return here, slope

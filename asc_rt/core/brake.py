@@ -7,11 +7,11 @@ this stop.
 
 from __future__ import annotations
 
-import numpy as np
+from numba import njit
 
 from asc_rt.core.smoothing import SetPoint, profile
 from asc_rt.core.system import System
-from asc_rt.core.types import CoreState, vector
+from asc_rt.core.types import CoreState, Vector
 
 # rad/s, rad/s2: under these the set-point is put to rest exactly.
 REST_SPEED = 1e-9
@@ -21,11 +21,18 @@ REST_ACCELERATION = 1e-6
 def brake(system: System, state: CoreState) -> SetPoint:
     """The set-point one period on along the stop. Raises smoothing.SmoothingError."""
     if at_rest(state):
-        zero = vector(np.zeros(system.n))
-        return SetPoint(state.q_cmd, zero, zero, zero)
+        return SetPoint(state.q_cmd, system.zero, system.zero, system.zero)
     zeros = [0.0] * system.n
     return profile(system, state, zeros, zeros)
 
 
 def at_rest(state: CoreState) -> bool:
-    return bool(np.all(np.abs(state.dq_cmd) < REST_SPEED) and np.all(np.abs(state.ddq_cmd) < REST_ACCELERATION))
+    return bool(_rests(state.dq_cmd, state.ddq_cmd))
+
+
+@njit(cache=True)
+def _rests(dq: Vector, ddq: Vector) -> bool:
+    rests = True
+    for i in range(dq.shape[0]):
+        rests = rests and abs(dq[i]) < REST_SPEED and abs(ddq[i]) < REST_ACCELERATION
+    return rests

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from asc_rt.core.kinematics import Motion, Three, cross
+from asc_rt.core.kinematics import Motion, cross, rotated
 from asc_rt.core.types import Matrix, Vector
 
 GRAVITY = 9.81  # m/s2, along -z of the base frame
@@ -41,15 +41,6 @@ def _world_inertia(rotation: Matrix, inertia: Matrix, half: Matrix, out: Matrix)
             out[a, b] = half[a, 0] * rotation[b, 0] + half[a, 1] * rotation[b, 1] + half[a, 2] * rotation[b, 2]
 
 
-@njit(cache=True, inline="always")
-def _apply(m: Matrix, v: Three) -> tuple[float, float, float]:
-    return (
-        m[0, 0] * v[0] + m[0, 1] * v[1] + m[0, 2] * v[2],
-        m[1, 0] * v[0] + m[1, 1] * v[1] + m[1, 2] * v[2],
-        m[2, 0] * v[0] + m[2, 1] * v[1] + m[2, 2] * v[2],
-    )
-
-
 @njit(cache=True)
 def inertia_and_bias(motion: Motion, bodies: Inertias) -> tuple[Matrix, Vector]:
     """(H, h)."""
@@ -59,16 +50,16 @@ def inertia_and_bias(motion: Motion, bodies: Inertias) -> tuple[Matrix, Vector]:
     half, world = np.empty((3, 3)), np.empty((3, 3))
     for k in range(n):
         omega, alpha, m = motion.omega[k], motion.alpha[k], bodies.mass[k]
-        lever = _apply(motion.rotation[k], bodies.com[k])
+        lever = rotated(motion.rotation[k], bodies.com[k])
         spin = cross(omega, lever)
         centripetal, tangential = cross(omega, spin), cross(alpha, lever)
         _world_inertia(motion.rotation[k], bodies.inertia[k], half, world)
-        gyro, torque = cross(omega, _apply(world, omega)), _apply(world, alpha)
+        gyro, torque = cross(omega, rotated(world, omega)), rotated(world, alpha)
         for i in range(k + 1):
             z = motion.axis[i]
             for a in range(3):
                 arm[a] = motion.origin[k, a] + lever[a] - motion.origin[i, a]
-            column, turned = cross(z, arm), _apply(world, z)
+            column, turned = cross(z, arm), rotated(world, z)
             for a in range(3):
                 Jv[i, a] = column[a]
                 gravity = GRAVITY if a == 2 else 0.0

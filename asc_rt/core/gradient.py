@@ -17,22 +17,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from asc_rt.core.abstraction import MIN_AXIS_DISTANCE, People, _nearest
-from asc_rt.core.dynamics import Inertias, _apply, _world_inertia
-from asc_rt.core.kinematics import Motion, Three, cross
+from asc_rt.core.abstraction import MIN_AXIS_DISTANCE, People, nearest
+from asc_rt.core.dynamics import Inertias, _world_inertia
+from asc_rt.core.kinematics import Motion, cross, dot, plus, rotated
 from asc_rt.core.limits import Bounds
 from asc_rt.core.robot_model import Arm
 from asc_rt.core.types import Vector
-
-
-@njit(cache=True, inline="always")
-def _dot(a: Three, b: Three) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True, inline="always")
-def _sum(a: Three, b: Three) -> tuple[float, float, float]:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @njit(cache=True)
@@ -56,21 +46,21 @@ def drift_gradient(motion: Motion, joint: int, r0: Vector, r1: Vector, people: P
     """d drift / d dq of one pair, (n,) 1/s; r0, r1: world end points of the robot capsule."""
     n = motion.origin.shape[0]
     h0, h1 = people.p0[h], people.p1[h]
-    s, t = _nearest(r0, r1, h0, h1)
+    s, t = nearest(r0, r1, h0, h1)
     e_r, e_h = r1 - r0, h1 - h0
     de_h = people.v1[h] - people.v0[h]
     point = r0 + s * e_r
     w = point - h0 - t * e_h
-    D = max(np.sqrt(_dot(w, w)), MIN_AXIS_DISTANCE)
+    D = max(np.sqrt(dot(w, w)), MIN_AXIS_DISTANCE)
     omega = motion.omega[joint]
     velocity = motion.velocity[joint] + np.array(cross(omega, point - motion.origin[joint]))
     rate = velocity - people.v0[h] - t * de_h
     J, J_dot = np.empty((n, 3)), np.empty((n, 3))
     _column_rates(motion, joint, point, velocity, J, J_dot)
-    d_dot = _dot(w, rate) / D
-    b_s = _dot(e_r, rate) + _dot(w, cross(omega, e_r))
-    b_t = -_dot(e_h, rate) - _dot(w, de_h)
-    rr, hh, rh = _dot(e_r, e_r), _dot(e_h, e_h), _dot(e_r, e_h)
+    d_dot = dot(w, rate) / D
+    b_s = dot(e_r, rate) + dot(w, cross(omega, e_r))
+    b_t = -dot(e_h, rate) - dot(w, de_h)
+    rr, hh, rh = dot(e_r, e_r), dot(e_h, e_h), dot(e_r, e_h)
     s_free, t_free = 0.0 < s < 1.0 and rr > 1e-12, 0.0 < t < 1.0 and hh > 1e-12
     det = rr * hh - rh * rh
     both = s_free and t_free and det > 1e-4 * rr * hh
@@ -78,9 +68,9 @@ def drift_gradient(motion: Motion, joint: int, r0: Vector, r1: Vector, people: P
     only_t = t_free and not both and not only_s
     out = np.zeros(n)
     for j in range(joint + 1):
-        C = _dot(w, J[j]) / D
-        db_s = _dot(e_r, J[j]) + _dot(w, cross(motion.axis[j], e_r))
-        db_t = -_dot(e_h, J[j])
+        C = dot(w, J[j]) / D
+        db_s = dot(e_r, J[j]) + dot(w, cross(motion.axis[j], e_r))
+        db_t = -dot(e_h, J[j])
         slip = 0.0
         if both:
             slip = (hh * b_s * db_s + rh * (b_s * db_t + b_t * db_s) + rr * b_t * db_t) / det
@@ -88,7 +78,7 @@ def drift_gradient(motion: Motion, joint: int, r0: Vector, r1: Vector, people: P
             slip = b_s * db_s / rr
         elif only_t:
             slip = b_t * db_t / hh
-        out[j] = 2.0 * (_dot(w, J_dot[j]) + _dot(rate, J[j]) - d_dot * C - slip) / D
+        out[j] = 2.0 * (dot(w, J_dot[j]) + dot(rate, J[j]) - d_dot * C - slip) / D
     return out
 
 
@@ -107,25 +97,25 @@ def bias_gradient(motion: Motion, bodies: Inertias, y: Vector) -> Vector:
     u, a = np.empty((n, 3)), np.empty((n, 3))
     turn, shift = np.zeros(3), np.zeros(3)
     for k in range(n):
-        lever, moment = _apply(motion.rotation[k], bodies.com[k]), cross(motion.axis[k], motion.origin[k])
+        lever, moment = rotated(motion.rotation[k], bodies.com[k]), cross(motion.axis[k], motion.origin[k])
         for x in range(3):
             turn[x] += y[k] * motion.axis[k, x]
             shift[x] += y[k] * moment[x]
-        velocity = cross(turn, _sum(motion.origin[k], lever))
+        velocity = cross(turn, plus(motion.origin[k], 1.0, lever))
         for x in range(3):
             a[k, x], u[k, x] = turn[x], velocity[x] - shift[x]
     first, push, second = np.zeros(3), np.zeros(3), np.zeros(3)
     for k in range(n - 1, -1, -1):
         omega, m2 = motion.omega[k], 2.0 * bodies.mass[k]
         _world_inertia(motion.rotation[k], bodies.inertia[k], half, world)
-        lever = _apply(motion.rotation[k], bodies.com[k])
-        turned = _apply(world, a[k])
+        lever = rotated(motion.rotation[k], bodies.com[k])
+        turned = rotated(world, a[k])
         about_com, by_speed = (
-            cross(_sum(motion.origin[k], lever), u[k]),
-            cross(_sum(motion.velocity[k], cross(omega, lever)), u[k]),
+            cross(plus(motion.origin[k], 1.0, lever), u[k]),
+            cross(plus(motion.velocity[k], 1.0, cross(omega, lever)), u[k]),
         )
-        gyro_a, gyro_b = cross(omega, turned), cross(_apply(world, omega), a[k])
-        gyro_c = _apply(world, cross(a[k], omega))
+        gyro_a, gyro_b = cross(omega, turned), cross(rotated(world, omega), a[k])
+        gyro_c = rotated(world, cross(a[k], omega))
         for x in range(3):
             push[x] += m2 * u[k, x]
             first[x] += m2 * about_com[x] + 2.0 * turned[x]

@@ -37,12 +37,33 @@ class Motion(NamedTuple):
     acceleration: np.ndarray  # (n, 3) m/s2, of the origin
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def cross(a: Three, b: Three) -> tuple[float, float, float]:
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@njit(cache=True)
+def dot(a: Three, b: Three) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def plus(a: Three, s: float, b: Three) -> tuple[float, float, float]:
+    """a + s b"""
+    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
+
+
+@njit(cache=True)
+def rotated(m: Matrix, v: Three) -> tuple[float, float, float]:
+    """m v"""
+    return (
+        m[0, 0] * v[0] + m[0, 1] * v[1] + m[0, 2] * v[2],
+        m[1, 0] * v[0] + m[1, 1] * v[1] + m[1, 2] * v[2],
+        m[2, 0] * v[0] + m[2, 1] * v[1] + m[2, 2] * v[2],
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from asc_rt.core import brake, gate, reference, smoothing, torque
 from asc_rt.core.smoothing import SetPoint
 from asc_rt.core.system import System
-from asc_rt.core.types import CommandKind, CoreState, CycleInputs, Mode, Vector, vector
+from asc_rt.core.types import CommandKind, CoreState, CycleInputs, Mode, Vector
 
 
 class Level(Protocol):
@@ -63,8 +63,7 @@ class Torque:
         if x.joint is None or state.mode not in (Mode.ACTIVE, Mode.STOPPING):
             return state
         if state.mode is Mode.STOPPING and np.all(np.abs(x.joint.dq) < torque.REST_SPEED):
-            zero = vector(np.zeros(system.n))
-            return dataclasses.replace(state, q_cmd=x.joint.q, dq_cmd=zero, ddq_cmd=zero)
+            return dataclasses.replace(state, q_cmd=x.joint.q, dq_cmd=system.zero, ddq_cmd=system.zero)
         return dataclasses.replace(state, q_cmd=x.joint.q, dq_cmd=x.joint.dq)
 
     def reference(self, system: System, state: CoreState) -> Vector:

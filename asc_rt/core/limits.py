@@ -99,6 +99,14 @@ def command_box(bounds: Bounds, q: Vector, dq: Vector, ddq: Vector, T: float) ->
 
 
 @njit(cache=True)
+def braking(bounds: Bounds, dq: Vector, lower: Vector, upper: Vector) -> Vector:
+    """A control within the bounds that brings every joint to rest: full braking, and in the end no faster than the jerk
+    can follow, (n,) rad/s2."""
+    brake: Vector = np.minimum(np.maximum(-dq * bounds.dddq_max / bounds.ddq_max, lower), upper)
+    return brake
+
+
+@njit(cache=True)
 def acceleration_box(bounds: Bounds, q: Vector, dq: Vector) -> tuple[Vector, Vector]:
     """Accelerations that joint i can reach *within a jerk ramp* without leaving its limits: the U that M is computed
     from.

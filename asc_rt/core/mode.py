@@ -9,41 +9,57 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
+from numba import njit
 
+from asc_rt.core import changer
 from asc_rt.core.brake import at_rest
+from asc_rt.core.human_ladder import judge
 from asc_rt.core.params import Params
 from asc_rt.core.types import (
     CoreState,
     CycleInputs,
     EventKind,
     Goal,
-    Health,
-    HumanState,
     JointState,
     Mode,
+    Monitor,
     RobotFlag,
     StopReason,
+    Vector,
 )
 
 
 def observe(params: Params, state: CoreState, x: CycleInputs) -> CoreState:
-    """Take over what the inputs bring: the seed of the set-point, a new goal, how long the robot has been silent."""
-    state = dataclasses.replace(state, silent_cycles=0 if x.joint else state.silent_cycles + 1)
+    """Take over what the inputs bring: the seed of the set-point, a new goal, the tool, how long the robot has been
+    silent."""
+    silent = 0 if x.joint else state.silent_cycles + 1
+    if silent != state.silent_cycles:
+        state = dataclasses.replace(state, silent_cycles=silent)
     if state.mode is Mode.IDLE and x.joint is not None:
         # The only seed from the measured pose: later a re-seed would be a jump of the set-point.
         state = dataclasses.replace(state, mode=Mode.HOLD, q_cmd=x.joint.q, goal=Goal(0, x.joint.q))
+    if (tool := changer.told(params, state, x)) != state.tool:
+        state = dataclasses.replace(state, tool=tool)
     if x.goal is not None and x.goal.id > state.goal.id and _inside(params, x.goal):
         state = dataclasses.replace(state, goal=x.goal)
     return state
 
 
-def next_mode(params: Params, state: CoreState, x: CycleInputs, d_measured: float) -> CoreState:
-    """Mode and reason of this cycle, from what was found and what the operator asked for."""
+def next_mode(
+    params: Params,
+    state: CoreState,
+    x: CycleInputs,
+    d_measured: float,
+    monitor: Monitor | None = None,
+    weighs_other: bool = False,
+) -> CoreState:
+    """Mode, reason and caution of this cycle, from what was found and what the operator asked for."""
     if state.mode.is_over:
         return state
-    finding = _finding(params, state, x)
-    state = _hear(params, state, x, finding, d_measured)
+    people = judge(params.human, x)
+    state = dataclasses.replace(state, slow=max(people.slow, StopReason.LATE if x.late else StopReason.NONE))
+    finding = _finding(params, state, x, people.stop, monitor)
+    state = _hear(params, state, x, finding, d_measured, weighs_other)
     if finding.is_fault or (state.mode is Mode.ACTIVE and finding is not StopReason.NONE):
         state = stopping(state, finding)
     if state.mode is Mode.STOPPING and at_rest(state):
@@ -74,6 +90,7 @@ def _hear(
     x: CycleInputs,
     finding: StopReason,
     d_measured: float,
+    weighs_other: bool,
 ) -> CoreState:
     for event in x.events:
         if event.id <= state.event_id:
@@ -85,10 +102,15 @@ def _hear(
                 refused = StopReason.LATE  # without a sample there is no distance to judge by
             elif finding is StopReason.NONE and not d_measured >= params.safety.rearm_distance:
                 refused = StopReason.START_INSIDE
+            elif finding is StopReason.NONE and weighs_other:
+                refused = StopReason.TOOL_MISMATCH
             armed = refused is StopReason.NONE
             state = dataclasses.replace(state, mode=Mode.ACTIVE if armed else state.mode, reason=refused)
         elif event.kind is EventKind.STOP and state.mode is Mode.ACTIVE:
             state = stopping(state, StopReason.OPERATOR_STOP)
+        elif event.kind is EventKind.TOOL and state.mode in (Mode.HOLD, Mode.STOPPED):
+            unknown = not changer.knows(params, event.tool)
+            state = dataclasses.replace(state, reason=StopReason.TOOL_MISMATCH if unknown else state.reason)
         elif event.kind is EventKind.END:
             state = dataclasses.replace(state, ending=True)
             if state.mode is not Mode.STOPPING:
@@ -96,11 +118,13 @@ def _hear(
     return state
 
 
-def _finding(params: Params, state: CoreState, x: CycleInputs) -> StopReason:
-    """The worst reason not to move that this cycle's inputs show."""
+def _finding(
+    params: Params, state: CoreState, x: CycleInputs, people: StopReason, monitor: Monitor | None
+) -> StopReason:
+    """The worst reason not to move that this cycle's inputs show; `people`: what the ladder says of the sensors."""
     if x.joint is None:
         silent = state.silent_cycles >= params.silence_cycles
-        return StopReason.ROBOT_SILENT if silent else _human_finding(params, x)
+        return StopReason.ROBOT_SILENT if silent else people
     if x.joint.flags & (RobotFlag.EMERGENCY_STOP | RobotFlag.FAULTED):
         return StopReason.ROBOT_FAULTED
     if not x.joint.flags & RobotFlag.READY:
@@ -109,37 +133,26 @@ def _finding(params: Params, state: CoreState, x: CycleInputs) -> StopReason:
         return StopReason.TRACKING
     if x.missed_ticks >= params.silence_cycles:
         return StopReason.LATE
-    return _human_finding(params, x)
-
-
-def _human_finding(params: Params, x: CycleInputs) -> StopReason:
-    if x.human_fault:
-        return StopReason.HUMAN_INVALID
-    if x.human is None:
-        return StopReason.HUMAN_MISSING
-    if not _is_finite(x.human):
-        return StopReason.HUMAN_INVALID
-    if x.human_age_ns > params.human.age_limit_ns:
-        return StopReason.HUMAN_STALE
-    if x.human_age_ns < -params.human.future_limit_ns or x.human.calibration_hash != params.human.calibration_hash:
-        return StopReason.HUMAN_INVALID
-    nobody_means_nothing = len(x.human.radius) == 0 and not x.human.empty_certified
-    if x.human.health is not Health.OK or nobody_means_nothing:
-        return StopReason.HUMAN_UNHEALTHY
-    return StopReason.NONE
-
-
-def _is_finite(human: HumanState) -> bool:
-    shape = (human.p0, human.p1, human.v0, human.v1, human.radius, human.position_bound, human.velocity_bound)
-    return all(bool(np.isfinite(values).all()) for values in shape)
+    if (wrong := changer.finding(params, state, x.joint)) is not StopReason.NONE:
+        return wrong
+    if people is StopReason.NONE and params.monitor.is_enforced and not (monitor and monitor.is_kept):
+        return StopReason.SEPARATION
+    return people
 
 
 def _follows(params: Params, state: CoreState, joint: JointState) -> bool:
     """|q_cmd - q| within the tolerance plus twice the way that the command latency explains."""
-    if not np.all(np.isfinite(joint.q)):
-        return False
-    explained = 2.0 * params.robot.command_latency_ns * 1e-9 * np.abs(state.dq_cmd)
-    return bool(np.all(np.abs(state.q_cmd - joint.q) <= params.tracking_tolerance + explained))
+    latency = params.robot.command_latency_ns * 1e-9
+    return bool(_near(state.q_cmd, joint.q, state.dq_cmd, params.tracking_tolerance, 2.0 * latency))
+
+
+@njit(cache=True)
+def _near(q_cmd: Vector, q: Vector, dq_cmd: Vector, tolerance: float, time: float) -> bool:
+    """False also for what is not a number."""
+    near = True
+    for i in range(q.shape[0]):
+        near = near and abs(q_cmd[i] - q[i]) <= tolerance + time * abs(dq_cmd[i])
+    return near
 
 
 def _inside(params: Params, goal: Goal) -> bool:

@@ -11,12 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from asc_rt.core.types import IntVector, Matrix, Vector
-
-BoolVector = npt.NDArray[np.bool_]
+from asc_rt.core.types import BoolVector, IntVector, Matrix, Vector
 
 TOLERANCE = 1e-9  # relative to the bounds: a row violated by less is kept
 NUDGE = 1e-11  # of the size of c: the value may be less by about this share of the size of U
@@ -29,6 +26,26 @@ class Polytope(NamedTuple):
     G: np.ndarray  # (m, n)
     low: np.ndarray  # (m,) Nm
     high: np.ndarray  # (m,)
+
+
+@njit(cache=True)
+def pack(U: Polytope) -> Matrix:
+    """A Polytope in one array, as kernels hand it over: (2, n) lower, upper; low, high and the n rows of G follow if
+    there are torque limits."""
+    n, m = U.lower.shape[0], U.G.shape[0]
+    packed = np.empty((4 + m if m else 2, n))
+    packed[0], packed[1] = U.lower, U.upper
+    if m:
+        packed[2], packed[3], packed[4:] = U.low, U.high, U.G
+    return packed
+
+
+@njit(cache=True)
+def unpack(packed: Matrix) -> Polytope:
+    """Inverse of `pack`: views."""
+    if packed.shape[0] > 2:
+        return Polytope(packed[0], packed[1], packed[4:], packed[2], packed[3])
+    return Polytope(packed[0], packed[1], packed[2:], packed[0, :0], packed[0, :0])
 
 
 class Support(NamedTuple):
@@ -52,6 +69,27 @@ def greatest(c: Vector, U: Polytope) -> float:
     for i in range(c.shape[0]):
         value += c[i] * (U.upper[i] if c[i] > 0.0 else U.lower[i])
     return value
+
+
+@njit(cache=True)
+def moved(best: Support, c: Vector, U: Polytope, c_there: Vector, there: Polytope) -> float:
+    """Change of max c . u from (c, U) to (c_there, there) nearby, to first order."""
+    n, change = c.shape[0], 0.0
+    for i in range(n):
+        change += (c_there[i] - c[i]) * best.u[i]
+        y = best.y[i]
+        if y > 0.0:
+            change += y * (there.upper[i] - U.upper[i])
+        elif y < 0.0:
+            change += y * (there.lower[i] - U.lower[i])
+    for r in range(U.G.shape[0]):
+        y = best.y[n + r]
+        if y == 0.0:
+            continue
+        change += y * (there.high[r] - U.high[r]) if y > 0.0 else y * (there.low[r] - U.low[r])
+        for k in range(n):
+            change -= y * (there.G[r, k] - U.G[r, k]) * best.u[k]
+    return change
 
 
 @njit(cache=True)
@@ -114,7 +152,16 @@ def support(c: Vector, U: Polytope) -> Support:
     """
     n = c.shape[0]
     multipliers = np.zeros(n + U.G.shape[0])
-    u, y = np.empty(n), np.empty(n)  # vertex; multipliers of the n active constraints
+    u = np.empty(n)
+    value = 0.0
+    for i in range(n):
+        u[i] = U.upper[i] if c[i] > 0.0 else U.lower[i]
+        value += c[i] * u[i]
+        multipliers[i] = c[i]
+    if _worst_row(u, U)[0] < 0:  # as nearly always: the vertex of the box will do
+        return Support(value, u, multipliers)
+    multipliers[:] = 0.0
+    y = np.empty(n)  # multipliers of the n active constraints
     active = np.arange(n)  # the active constraints: < n box, >= n row of G
     at_upper = c > 0.0
     inverse = np.eye(n)  # of the matrix whose rows are the active constraints' normals

@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from asc_rt.core.dynamics import Inertias
 from asc_rt.core.kinematics import Chain
 from asc_rt.core.limits import Bounds
 from asc_rt.core.params import CapsuleSpec, RobotParams, ToolParams
+from asc_rt.core.types import Vector, vector
 
 
 class ModelError(Exception):
@@ -40,6 +42,7 @@ class Arm(NamedTuple):
 class RobotModel(NamedTuple):
     pin_model: pin.Model  # the controlled joints only; tests compare against it
     arm: Arm
+    packed: Vector  # see `pack`
     capsule_names: tuple[str, ...]
 
     @property
@@ -82,13 +85,55 @@ def load(robot: RobotParams, tool: ToolParams, control: str = "acceleration") ->
     if control == "torque" and len(effort) != model.nv:
         raise ModelError(f"robot {robot.name}: torque control needs a torque limit (effort) for every joint")
     specs = (*robot.capsules, *tool.capsules)
+    arm = Arm(_chain(model), _capsules(model, specs), _bodies(model), _bounds(robot), effort)
     return RobotModel(
         pin_model=model,
-        arm=Arm(_chain(model), _capsules(model, specs), _bodies(model), _bounds(robot), effort),
+        arm=arm,
+        packed=pack(arm),
         capsule_names=tuple(
             [f"{c.link}.{i}" for i, c in enumerate(robot.capsules)]
             + [f"{tool.name}.{i}" for i in range(len(tool.capsules))]
         ),
+    )
+
+
+def pack(arm: Arm) -> Vector:
+    """An Arm in one array: a tuple of arrays that Python hands to a kernel costs two microseconds.
+
+    n joints, m capsules, the capsules' joints, then the arrays one after the other.
+    """
+    c, k, b = arm.chain, arm.capsules, arm.bodies
+    sizes = (len(b.mass), len(k.radius))
+    return vector(np.concatenate([np.ravel(a) for a in (sizes, k.joint, *c, *k[1:], *b, *arm.bounds, arm.effort)]))
+
+
+@njit(cache=True)
+def unpack(packed: Vector) -> Arm:
+    """Inverse of `pack`: views, but for the capsules' joints."""
+    n, m = int(packed[0]), int(packed[1])
+    joints, x = packed[2 : 2 + m].astype(np.int64), packed[2 + m :]
+    p0 = 15 * n  # after the chain
+    mass = p0 + 7 * m
+    q_min = mass + 13 * n
+    return Arm(
+        Chain(x[: 9 * n].reshape(n, 3, 3), x[9 * n : 12 * n].reshape(n, 3), x[12 * n : p0].reshape(n, 3)),
+        Capsules(
+            joints,
+            x[p0 : p0 + 3 * m].reshape(m, 3),
+            x[p0 + 3 * m : p0 + 6 * m].reshape(m, 3),
+            x[p0 + 6 * m : mass],
+        ),
+        Inertias(
+            x[mass : mass + n], x[mass + n : mass + 4 * n].reshape(n, 3), x[mass + 4 * n : q_min].reshape(n, 3, 3)
+        ),
+        Bounds(
+            x[q_min : q_min + n],
+            x[q_min + n : q_min + 2 * n],
+            x[q_min + 2 * n : q_min + 3 * n],
+            x[q_min + 3 * n : q_min + 4 * n],
+            x[q_min + 4 * n : q_min + 5 * n],
+        ),
+        x[q_min + 5 * n :],
     )
 
 

@@ -2,99 +2,158 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from asc_rt.core.abstraction import Separation, least_distance, radii, separation
-from asc_rt.core.limits import command_box
-from asc_rt.core.people import predict
-from asc_rt.core.polytope import Polytope
+from asc_rt.core import polytope, safety_index
+from asc_rt.core.abstraction import Separation, least_distance, nearest_first, picked, separation_at
+from asc_rt.core.kinematics import forward
+from asc_rt.core.limits import braking, command_box
+from asc_rt.core.people import carried, seen
+from asc_rt.core.radius import radii_at
+from asc_rt.core.realizable import with_torque
+from asc_rt.core.robot_model import unpack
 from asc_rt.core.safe_control import Solution
-from asc_rt.core.safety_index import phi_rate, row_floors
+from asc_rt.core.safety_index import free_pairs, phi_rate, row_floors
 from asc_rt.core.smoothing import SetPoint
 from asc_rt.core.system import System
-from asc_rt.core.torque import command_set
 from asc_rt.core.types import (
     MAX_PAIRS,
     CoreState,
     CycleInputs,
+    IntMatrix,
     IntVector,
     Matrix,
     Mode,
+    Monitor,
     Pairs,
     SafetyDecision,
     Status,
-    StopReason,
     Vector,
+    frozen,
     vector,
 )
 
+NONE, NO_INDEX = vector([]), np.zeros(0, dtype=np.int64)
+NO_PAIRS = Pairs(NO_INDEX, NO_INDEX, NONE, NONE, NONE, NONE, NONE, NONE, NONE, NONE, NO_INDEX, NO_INDEX)
 
-@dataclass(frozen=True, slots=True)
-class Rows:
-    """All active pairs, nearest first: the row of pair i is C[i] u >= floor[i]."""
 
-    pairs: Separation
-    M: Vector  # (p,) m/s2
-    M_dot: Vector  # (p,) m/s3
-    phi: Vector  # (p,)
-    floor: Vector  # (p,) m/s2
-    base: Vector  # (p,) m/s2
-    basis: IntVector  # (p,) Basis
-    U: Polytope  # what the joint limits allow this period
+class Rows(NamedTuple):
+    """All active pairs, nearest first: the row of pair i is C[i] u >= floor[i]. In few arrays, because handing one over
+    from a kernel costs more than filling it."""
+
+    which: IntMatrix  # (4, p) robot capsule, human capsule, Basis of the floor, Outside
+    values: Matrix  # (10, p) see the properties
+    C: Matrix  # (p, n) m
+    box: Matrix  # what the joint and torque limits allow this period, see polytope.pack
+
+    def _row(self, i: int) -> Vector:
+        row: Vector = self.values[i]
+        return row
 
     @property
-    def C(self) -> Matrix:
-        return self.pairs.C
+    def M(self) -> Vector:
+        """m/s2"""
+        return self._row(0)
+
+    @property
+    def M_dot(self) -> Vector:
+        """m/s3"""
+        return self._row(1)
+
+    @property
+    def phi(self) -> Vector:
+        return self._row(2)
+
+    @property
+    def floor(self) -> Vector:
+        """m/s2"""
+        return self._row(3)
+
+    @property
+    def base(self) -> Vector:
+        """m/s2, see safe_control"""
+        return self._row(4)
+
+    @property
+    def basis(self) -> IntVector:
+        basis: IntVector = self.which[2]
+        return basis
+
+    @property
+    def pairs(self) -> Separation:
+        d, d_dot, drift, own, own_drift = self.values[5:]
+        return Separation(self.which[0], self.which[1], d, d_dot, self.C, drift, own, own_drift)
 
 
 def rows(system: System, state: CoreState, x: CycleInputs) -> Rows:
     """Rows at the commanded state against the people of one command latency from now."""
-    s, r = system.params.safety, system.params.robot
-    people = predict(x.human, (x.human_age_ns + r.command_latency_ns) * 1e-9)
-    model = (system.model.chain, system.model.capsules, people)
+    p, s = system.params, system.params.safety
+    horizon = (x.human_age_ns + p.robot.command_latency_ns) * 1e-9
     q, dq, ddq = state.q_cmd, state.dq_cmd, state.ddq_cmd
-    found = separation(*model, q, dq, s.activation_distance, s.human_acceleration)
-    order = np.argsort(found.d, kind="stable")
-    found = Separation(*(values[order] for values in found))
-    M, M_dot = radii(system.model.arm, people, q, dq, ddq, s.human_acceleration, found)
-    T, b = system.params.period, system.bounds
-    brake_time = float(np.max(np.abs(dq) / b.ddq_max + b.ddq_max / b.dddq_max))
-    U = command_set(system, q, dq, *command_box(b, q, dq, ddq, T))
-    value, floor, base, basis = row_floors(
-        found,
-        M,
-        M_dot,
-        ddq,
-        b.dddq_max,
-        U.lower,
-        U.upper,
-        T,
-        s.d_min,
-        s.k,
-        s.eta,
-        s.M_floor,
-        brake_time,
+    people, reach, a_h = seen(x.human), s.activation_distance, s.human_acceleration
+    return Rows(*_rows(system.model.packed, system.packed_index, people, horizon, q, dq, ddq, p.period, reach, a_h))
+
+
+@njit(cache=True)
+def _rows(
+    packed: Vector,
+    packed_index: Vector,
+    people: Matrix,
+    horizon: float,
+    q: Vector,
+    dq: Vector,
+    ddq: Vector,
+    T: float,
+    reach: float,
+    human_acceleration: float,
+) -> tuple[IntMatrix, Matrix, Matrix, Matrix]:
+    """The fields of `Rows`."""
+    arm, index = unpack(packed), safety_index.unpack(packed_index)
+    b = arm.bounds
+    then = carried(people, horizon)
+    motion = forward(arm.chain, q, dq)
+    pairs = nearest_first(separation_at(motion, arm.capsules, then, reach, human_acceleration))
+    lower, upper = command_box(b, q, dq, ddq, T)
+    U = with_torque(arm, motion, lower, upper)
+    brake_time = np.max(np.abs(dq) / b.ddq_max + b.ddq_max / b.dddq_max)
+    free = free_pairs(pairs, ddq, b.dddq_max, lower, upper, T, index, brake_time)
+    M, M_dot, others = np.zeros(free.shape[0]), np.zeros(free.shape[0]), np.flatnonzero(~free)
+    M[others], M_dot[others] = radii_at(arm, motion, then, q, dq, ddq, human_acceleration, picked(pairs, others))
+    value, floor, base, basis, outside = row_floors(
+        pairs, free, M, M_dot, ddq, b.dddq_max, lower, upper, braking(b, dq, lower, upper), T, index, brake_time
     )
-    return Rows(
-        found,
-        M,
-        M_dot,
-        value,
-        floor,
-        base,
-        basis,
-        U,
-    )
+    which, values = np.empty((4, M.shape[0]), np.int64), np.empty((10, M.shape[0]))
+    which[0], which[1], which[2], which[3] = pairs.robot, pairs.human, basis, outside
+    values[0], values[1], values[2], values[3], values[4] = M, M_dot, value, floor, base
+    values[5], values[6], values[7] = pairs.d, pairs.d_dot, pairs.drift
+    values[8], values[9] = pairs.d_dot_robot, pairs.drift_robot
+    return which, values, pairs.C, polytope.pack(U)
 
 
 def nearest_measured(system: System, x: CycleInputs) -> float:
     """Smallest separation distance of the measured arm from the people of now, m; inf without a pair."""
     if x.joint is None or x.human is None:
-        return float("inf")
-    people = predict(x.human, x.human_age_ns * 1e-9)
-    return float(least_distance(system.model.chain, system.model.capsules, people, x.joint.q))
+        return math.inf
+    return _nearest(system, x, x.joint.q)
+
+
+def nearest_at_goal(system: System, state: CoreState, x: CycleInputs) -> float:
+    """Smallest separation distance of the arm at its goal from the people of now, m; inf without a goal or a pair."""
+    return _nearest(system, x, state.goal.q) if state.goal.id > 0 and x.human is not None else math.inf
+
+
+def _nearest(system: System, x: CycleInputs, q: Vector) -> float:
+    return float(_nearest_at(system.model.packed, seen(x.human), x.human_age_ns * 1e-9, q))
+
+
+@njit(cache=True)
+def _nearest_at(packed: Vector, people: Matrix, horizon: float, q: Vector) -> float:
+    arm = unpack(packed)
+    return least_distance(arm.chain, arm.capsules, carried(people, horizon), q)
 
 
 def decision(
@@ -103,20 +162,24 @@ def decision(
     found: Rows | None,
     solution: Solution | None,
     d_measured: float,
+    d_goal: float,
+    monitor: Monitor | None,
     point: SetPoint | None = None,
 ) -> SafetyDecision:
     """What goes into the record; pairs beyond MAX_PAIRS were in the QP and are only counted."""
-    zero = vector(np.zeros(system.n))
+    zero = system.zero
     return SafetyDecision(
         status=_status(state, solution),
         reason=state.reason,
         u_ref=vector(solution.u_ref) if solution else zero,
         u_safe=vector(solution.u) if solution and solution.feasible else zero,
         pairs=_pairs(system, found, point.ddq if point else zero),
-        pair_count=len(found.M) if found else 0,
+        pair_count=found.which.shape[1] if found else 0,
         iterations=solution.iterations if solution else 0,
         share=solution.share if solution else 1.0,
         d_measured=d_measured,
+        d_goal=d_goal,
+        monitor=monitor,
     )
 
 
@@ -125,28 +188,39 @@ def _status(state: CoreState, solution: Solution | None) -> Status:
         return Status.INFEASIBLE
     if solution is not None and state.mode is Mode.ACTIVE:
         return Status.FILTERED if solution.filtered else Status.PASS
-    human = StopReason.HUMAN_MISSING <= state.reason <= StopReason.HUMAN_INVALID
+    human = state.reason.is_of_people
     return Status.BAD_INPUT if state.mode is Mode.STOPPING and human else Status.STOPPED
 
 
 def _pairs(system: System, found: Rows | None, ddq: Vector) -> Pairs:
-    none = np.zeros(0, dtype=np.int64)
     if found is None:
-        empty = vector([])
-        return Pairs(none, none, empty, empty, empty, empty, empty, empty, empty, empty, none)
-    p = slice(0, MAX_PAIRS)
-    s, pairs = system.params.safety, found.pairs
-    achieved = pairs.C @ ddq
+        return NO_PAIRS
+    achieved, rate = _achieved(found.values, found.C, ddq, system.packed_index)
+    p = MAX_PAIRS
+    frozen(found.values), frozen(found.which)
     return Pairs(
-        robot=pairs.robot[p],
-        human=pairs.human[p],
-        d=vector(pairs.d[p]),
-        d_dot=vector(pairs.d_dot[p]),
-        M=vector(found.M[p]),
-        M_dot=vector(found.M_dot[p]),
-        phi=vector(found.phi[p]),
-        phi_dot=vector(phi_rate(pairs, found.M, found.M_dot, achieved, s.d_min, s.k)[p]),
-        floor=vector(found.floor[p]),
-        achieved=vector(achieved[p]),
-        basis=found.basis[p],
+        robot=found.which[0, :p],
+        human=found.which[1, :p],
+        d=found.values[5, :p],
+        d_dot=found.values[6, :p],
+        M=found.M[:p],
+        M_dot=found.M_dot[:p],
+        phi=found.phi[:p],
+        phi_dot=frozen(rate)[:p],
+        floor=found.floor[:p],
+        achieved=frozen(achieved)[:p],
+        basis=found.basis[:p],
+        outside=found.which[3, :p],
     )
+
+
+@njit(cache=True)
+def _achieved(values: Matrix, C: Matrix, ddq: Vector, packed_index: Vector) -> tuple[Vector, Vector]:
+    """C u and phi_dot of what is sent."""
+    p, index = C.shape[0], safety_index.unpack(packed_index)
+    achieved, rate = np.zeros(p), np.empty(p)
+    for i in range(p):
+        for j in range(ddq.shape[0]):
+            achieved[i] += C[i, j] * ddq[j]
+        rate[i] = phi_rate(values[5, i], values[6, i], achieved[i] + values[7, i], values[0, i], values[1, i], index)
+    return achieved, rate

@@ -2,11 +2,12 @@
 
     min_u  sum_i ((u_i - u_ref_i) / scale_i)^2   s.t.   C u >= floor,   u in U (joint limits, torque limits)
 
-When the rows conflict, in this order: the joint limits hold; rows that rest on the index hold; rows that ask for the
-ramp (a person comes faster than the arm can make good) share what is there:
+When the rows conflict, in this order: the joint limits hold; rows that rest on the index hold; the others (a person
+comes faster than the arm can make good, or is outside the certified ranges) share what is there:
     min  ... + PRESSING (1 - share)^2   s.t.   C u >= base + share (floor - base),   0 <= share <= 1
-base is what the commanded acceleration gives already, so share says how much of the extra braking was possible; it is
-recorded. Rows of the index that cannot be kept have no share and no slack: INFEASIBLE, and the robot brakes.
+base (`safety_index`) is about what the commanded acceleration gives already, so share says how much of the extra
+braking was possible; it is recorded. Rows of the index that cannot be kept have no share and no slack, and base is kept
+by all: INFEASIBLE, and the robot brakes.
 
 PIQP, set up afresh each cycle: a reused solver carries its history and does not replay to the bit. Limits are by
 iteration, never by time.
@@ -18,11 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import piqp
+from numba import njit
 
-from asc_rt.core.polytope import Polytope
-from asc_rt.core.types import Matrix, Vector
+from asc_rt.core.polytope import unpack
+from asc_rt.core.types import IntVector, Matrix, Vector
 
-MAX_ITERATIONS = 60
+MAX_ITERATIONS, TOLERANCE = 60, 1e-9
 # Rows are asked for with this margin and the box is drawn in by it, so that the solver's own tolerance stays inside the
 # limits: m/s2 and share of ddq_max.
 SOLVER_MARGIN = 1e-6
@@ -40,42 +42,91 @@ class Solution:
     share: float  # 1: every row whole; less: of the ramp, see above
 
 
-def solve(u_ref: Vector, C: Matrix, floor: Vector, base: Vector, U: Polytope, scale: Vector) -> Solution:
-    """`base` <= floor, equal where a row has no share; `scale`: ddq_max, (n,), rad/s2."""
-    if np.any(np.isnan(floor)) or np.any(floor == np.inf):
+def solve(u_ref: Vector, C: Matrix, floor: Vector, base: Vector, U: Matrix, scale: Vector) -> Solution:
+    """`base` <= floor, equal where a row has no share; `U`: packed; `scale`: ddq_max, (n,), rad/s2."""
+    boxed, fits, sound, graded, binding = _screen(u_ref, C, floor, base, U)
+    if not sound:
         return Solution(u_ref, u_ref, False, True, 0, 0.0)
-    boxed = np.clip(u_ref, U.lower, U.upper)  # the reference is a wish; the limits are in the QP below as well
-    if np.all(C @ boxed >= floor) and _inside(boxed, U):
+    if fits:
         return Solution(u_ref, boxed, True, False, 0, 1.0)
-    # Rows that no control in the box can violate are left out, exactly.
-    binding = np.where(C > 0.0, C * U.lower, C * U.upper).sum(axis=1) < floor + SOLVER_MARGIN
-    whole, floor_bound, base_bound = C[binding], floor[binding], base[binding]
-    found = _quadratic(u_ref, whole, floor_bound, np.zeros(len(floor_bound)), U, scale, shared=False)
+    found = _quadratic(u_ref, C, floor, floor, binding, U, scale, False)
     iterations, share = found.iterations, 1.0
-    graded = floor_bound - base_bound
-    if not found.solved and np.any(graded > 0.0):
-        found = _quadratic(u_ref, whole, base_bound, graded, U, scale, shared=True)
+    if not found.solved and graded:
+        found = _quadratic(u_ref, C, floor, base, binding, U, scale, True)
         iterations, share = iterations + found.iterations, found.share
-    kept = found.solved and bool(np.all(C @ found.u >= base + share * (floor - base)) and _inside(found.u, U))
+    kept = found.solved and bool(_keeps(found.u, C, floor, base, share, U))
     return Solution(u_ref, found.u, kept, True, iterations, share)
 
 
-def project(u: Vector, U: Polytope, scale: Vector) -> Vector | None:
-    """The control of U nearest to u; None if U is empty."""
-    if _inside(u, U):
+def project(u: Vector, U: Matrix, scale: Vector) -> Vector | None:
+    """The control of U (packed) nearest to u; None if U is empty."""
+    if inside(u, U):
         return u
-    none = np.zeros((0, len(u)))
-    found = _quadratic(u, none, np.zeros(0), np.zeros(0), U, scale, shared=False)
-    return found.u if found.solved and _inside(found.u, U) else None
+    found = _quadratic(u, np.zeros((0, len(u))), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), U, scale, False)
+    return found.u if found.solved and inside(found.u, U) else None
 
 
-def _inside(u: Vector, U: Polytope) -> bool:
-    torque = U.G @ u
-    return bool(
-        np.all(np.isfinite(u))
-        and np.all((u >= U.lower) & (u <= U.upper))
-        and np.all((torque >= U.low) & (torque <= U.high))
-    )
+@njit(cache=True)
+def _screen(
+    u_ref: Vector, C: Matrix, floor: Vector, base: Vector, packed: Matrix
+) -> tuple[Vector, bool, bool, bool, IntVector]:
+    """(reference within the box; does it keep everything; are the rows numbers; has one a share; rows that bind).
+
+    The reference is a wish; the limits are in the QP as well. Rows that no control in the box can violate do not bind:
+    they are left out, exactly.
+    """
+    U, n = unpack(packed), u_ref.shape[0]
+    boxed = np.empty(n)
+    for j in range(n):
+        boxed[j] = min(max(u_ref[j], U.lower[j]), U.upper[j])
+    fits, sound, graded = inside(boxed, packed), True, False
+    binding, count = np.empty(floor.shape[0], np.int64), 0
+    for i in range(floor.shape[0]):
+        value = least = 0.0
+        for j in range(n):
+            value += C[i, j] * boxed[j]
+            least += C[i, j] * (U.lower[j] if C[i, j] > 0.0 else U.upper[j])
+        fits = fits and value >= floor[i]
+        sound = sound and floor[i] < np.inf
+        if least < floor[i] + SOLVER_MARGIN:
+            binding[count] = i
+            count += 1
+            graded = graded or floor[i] > base[i]
+    return boxed, fits, sound, graded, binding[:count]
+
+
+@njit(cache=True)
+def inside(u: Vector, packed: Matrix) -> bool:
+    """Is u in the packed polytope; False also if u is not a number."""
+    U = unpack(packed)
+    for j in range(u.shape[0]):
+        if not U.lower[j] <= u[j] <= U.upper[j]:
+            return False
+    for r in range(U.G.shape[0]):
+        value = 0.0
+        for j in range(u.shape[0]):
+            value += U.G[r, j] * u[j]
+        if not U.low[r] <= value <= U.high[r]:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _keeps(u: Vector, C: Matrix, floor: Vector, base: Vector, share: float, U: Matrix) -> bool:
+    """Every row, with the share of its ramp, and every bound."""
+    return keeps_rows(u, C, base + share * (floor - base)) and inside(u, U)
+
+
+@njit(cache=True)
+def keeps_rows(u: Vector, C: Matrix, floor: Vector) -> bool:
+    """C u >= floor; False also for what is not a number."""
+    for i in range(floor.shape[0]):
+        value = 0.0
+        for j in range(u.shape[0]):
+            value += C[i, j] * u[j]
+        if not value >= floor[i]:
+            return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,30 +138,73 @@ class _Found:
 
 
 def _quadratic(
-    u_ref: Vector, C: Matrix, base: Vector, graded: Vector, U: Polytope, scale: Vector, shared: bool
+    u_ref: Vector,
+    C: Matrix,
+    floor: Vector,
+    base: Vector,
+    binding: IntVector,
+    U: Matrix,
+    scale: Vector,
+    shared: bool,
 ) -> _Found:
     """One PIQP call in u / scale, with the share as one more variable if `shared`."""
-    n, extra = len(u_ref), int(shared)
-    inset = np.minimum(SOLVER_MARGIN * scale, 0.5 * (U.upper - U.lower))
-    weight = np.concatenate((np.ones(n), np.full(extra, PRESSING)))
-    rows = np.hstack((C * scale, -graded[:, None])) if shared else C * scale
-    torque = np.hstack((U.G * scale, np.zeros((len(U.low), extra))))
-    solver = piqp.DenseSolver()
-    solver.settings.max_iter = MAX_ITERATIONS
-    solver.settings.eps_abs = 1e-9
-    solver.settings.eps_rel = 1e-9
-    solver.setup(
-        np.diag(weight),
-        -weight * np.concatenate((u_ref / scale, np.ones(extra))),
-        None,
-        None,
-        np.asfortranarray(np.vstack((rows, torque))),
-        np.concatenate((base + SOLVER_MARGIN, U.low + SOLVER_MARGIN)),
-        np.concatenate((np.full(len(base), np.inf), U.high - SOLVER_MARGIN)),
-        np.concatenate(((U.lower + inset) / scale, np.zeros(extra))),
-        np.concatenate(((U.upper - inset) / scale, np.ones(extra))),
-    )
+    n, solver = len(u_ref), piqp.DenseSolver()
+    settings = solver.settings
+    settings.max_iter, settings.eps_abs, settings.eps_rel = MAX_ITERATIONS, TOLERANCE, TOLERANCE
+    P, c, G, low, high, lower, upper = _program(u_ref, C, floor, base, binding, U, scale, shared)
+    solver.setup(P, c, None, None, G, low, high, lower, upper)
     solved = solver.solve() == piqp.PIQP_SOLVED
-    x = solver.result.x
+    result = solver.result
+    x = result.x
     share = float(min(1.0, max(0.0, x[n]))) - SOLVER_MARGIN if shared else 1.0
-    return _Found(x[:n] * scale, share, solved, int(solver.result.info.iter))
+    return _Found(x[:n] * scale, share, solved, int(result.info.iter))
+
+
+@njit(cache=True)
+def _program(
+    u_ref: Vector,
+    C: Matrix,
+    floor: Vector,
+    base: Vector,
+    binding: IntVector,
+    packed: Matrix,
+    scale: Vector,
+    shared: bool,
+) -> tuple[Matrix, Vector, Matrix, Vector, Vector, Vector, Vector]:
+    """(P, c, G, low, high, lower, upper) of  min x P x / 2 + c x,  low <= G x <= high,  lower <= x <= upper.
+
+    x = u / scale, and the share if `shared`. Torque rows that no control in the box can violate are left out, exactly.
+    """
+    U, n, extra, p = unpack(packed), u_ref.shape[0], int(shared), binding.shape[0]
+    P, c = np.zeros((n + extra, n + extra)), np.empty(n + extra)
+    lower, upper = np.zeros(n + extra), np.ones(n + extra)
+    for j in range(n):
+        inset = min(SOLVER_MARGIN * scale[j], 0.5 * (U.upper[j] - U.lower[j]))
+        lower[j], upper[j] = (U.lower[j] + inset) / scale[j], (U.upper[j] - inset) / scale[j]
+        P[j, j], c[j] = 1.0, -u_ref[j] / scale[j]
+    if shared:
+        P[n, n], c[n] = PRESSING, -PRESSING
+    torque, count = np.empty(U.G.shape[0], np.int64), 0
+    for r in range(U.G.shape[0]):
+        least = most = 0.0
+        for j in range(n):
+            a, b = U.G[r, j] * U.lower[j], U.G[r, j] * U.upper[j]
+            least, most = least + min(a, b), most + max(a, b)
+        if least < U.low[r] + SOLVER_MARGIN or most > U.high[r] - SOLVER_MARGIN:
+            torque[count] = r
+            count += 1
+    G = np.zeros((n + extra, p + count)).T  # column by column, as the solver reads it
+    low, high = np.empty(p + count), np.full(p + count, np.inf)
+    for i in range(p):
+        row = binding[i]
+        low[i] = base[row] + SOLVER_MARGIN
+        for j in range(n):
+            G[i, j] = C[row, j] * scale[j]
+        if shared:
+            G[i, n] = base[row] - floor[row]
+    for i in range(count):
+        r = torque[i]
+        low[p + i], high[p + i] = U.low[r] + SOLVER_MARGIN, U.high[r] - SOLVER_MARGIN
+        for j in range(n):
+            G[p + i, j] = U.G[r, j] * scale[j]
+    return P, c, G, low, high, lower, upper

@@ -25,19 +25,23 @@ No row asks for more than the smallest of three (`Basis` says which):
     INDEX       what psi asks for
     STANDSTILL  that the robot's own approach, ramps included, ends: a robot that does not approach is safe however fast
                 the person comes (ISO 10218-2, speed and separation monitoring); retreating is never slowed. Inside
-                d_min the index asks for no less than this.
+                d_min, and near a person faster than the certificate's v_max, the index asks for no less than this.
     RAMP        the ramp itself: the share JERK_SHARE of what the joint bounds of this period leave, up to BRAKE_SHARE M
+
+Most pairs are far away: no control of the period can break their row (FREE), which is known without M.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from asc_rt.core.abstraction import Separation
-from asc_rt.core.types import Basis, IntVector, Vector
+from asc_rt.core.params import SafetyParams
+from asc_rt.core.types import Basis, BoolVector, IntVector, Outside, Vector
 
 # ASSUMED: share of a pair's jerk (sum of |C_i| dddq_max_i) that the index counts on. The rest serves the other rows
 # and the change of C and drift during the ramp, which the index takes as constant.
@@ -48,6 +52,9 @@ BRAKE_SHARE = 0.8
 # ASSUMED: m/s2. The ramp is asked for with this much less, so that a pair whose joints are all at their bounds has a
 # solution.
 SLACKEN = 1e-3
+# ASSUMED: what rows give way where they conflict, see `_base`. With neither, people beside the arm at 3 m/s2 of assumed
+# acceleration stopped it in 2 of 6 visits by a conflict of 1 to 6 mm/s2.
+WEAKEN, STANDSTILL_BASE = 0.1, 0.5
 # ASSUMED: m/s. A robot slower than this stands still: the bound that lets u = 0 keep every row at rest, strictly.
 # Well under what counts as approaching when runs are judged (10 mm/s). It fades out towards d_min (1/s), or the robot
 # would creep through d_min into a person who stands still; what is left is 4 mm in an hour.
@@ -60,10 +67,39 @@ NO_JERK = 1e-6
 # m/s2: a floor that every control keeps; finite, so that arithmetic with floors is.
 NO_ROW = -1e6
 
-SHARPNESS = 28  # bisections of a row: 1e-6 m/s2 of 200, and the safe end is taken
+# A row is searched for until it is known to SHARPNESS, m/s2, or psi is that CLOSE to its target; the safe end is taken.
+SHARPNESS, CLOSE, SEARCH_MOST = 1e-6, 1e-10, 60
 SEARCHES, POLISHES = 5, 2  # steps to the largest phi of a brake; smooth there: within 1e-5 of it
 
-INDEX, STANDSTILL, RAMP, M_FLOOR = (int(b) for b in (Basis.INDEX, Basis.STANDSTILL, Basis.RAMP, Basis.M_FLOOR))
+INDEX, STANDSTILL, RAMP, M_FLOOR, FREE = (int(b) for b in Basis)
+OUTSIDE_DISTANCE, OUTSIDE_SPEED, OUTSIDE_RADIUS = (int(flag) for flag in Outside if flag)
+
+
+PHI_STAR, PHI_B = 0, 1
+
+
+class Index(NamedTuple):
+    """Which index, its constants, and the approach speed up to which it is certified."""
+
+    kind: int  # PHI_STAR or PHI_B
+    d_min: float  # m
+    k: float  # of phi*
+    brake: float  # m/s2, of phi_b
+    eta: float  # 1/s
+    M_floor: float  # m/s2
+    v_max: float  # m/s
+
+
+def index_of(safety: SafetyParams) -> Index:
+    kind = {"phi-star": PHI_STAR, "phi-b": PHI_B}[safety.index]
+    return Index(kind, safety.d_min, safety.k, safety.brake, safety.eta, safety.M_floor, safety.v_max)
+
+
+@njit(cache=True)
+def unpack(packed: Vector) -> Index:
+    """An Index from its numbers in one array, which is how Python hands it to a kernel fastest."""
+    x = packed
+    return Index(int(x[0]), x[1], x[2], x[3], x[4], x[5], x[6])
 
 
 @njit(cache=True)
@@ -72,8 +108,15 @@ def phi_star(d: float, v: float, M: float, d_min: float, k: float) -> float:
 
 
 @njit(cache=True)
-def phi(d: float, v: float, M: float, d_min: float, k: float) -> float:
-    return max(d_min - d, phi_star(d, v, M, d_min, k))
+def phi_b(d: float, v: float, d_min: float, brake: float) -> float:
+    return d_min - d + (v * v / (2.0 * brake) if v > 0.0 else 0.0)
+
+
+@njit(cache=True)
+def phi(d: float, v: float, M: float, index: Index) -> float:
+    if index.kind == PHI_B:
+        return phi_b(d, v, index.d_min, index.brake)
+    return max(index.d_min - d, phi_star(d, v, M, index.d_min, index.k))
 
 
 @njit(cache=True)
@@ -87,33 +130,13 @@ def _braking(t: float, d: float, v: float, a: float, B: float, J: float) -> tupl
 
 
 @njit(cache=True)
-def psi(
-    d: float,
-    v: float,
-    a: float,
-    M: float,
-    M_dot: float,
-    J: float,
-    d_min: float,
-    k: float,
-    M_floor: float,
-) -> float:
-    """Largest phi on the hardest brake from (d, v, a); see above. M is taken as it will be at the end of the ramp."""
-    now = phi(d, v, max(M_floor, M), d_min, k)
-    square = a * a + 2.0 * J * v
-    if v < 0.0:  # retreating: the approach begins, if ever, where v = 0
-        if a <= 0.0 or square <= 0.0:
-            return now
-        d = _braking((a - math.sqrt(square)) / J, d, v, a, 0.0, J)[0]
-        v, a = 0.0, math.sqrt(square)
-    M = max(M_floor, M + min(0.0, M_dot) * max(0.0, a + BRAKE_SHARE * M) / J)
-    B = max(BRAKE_SHARE * M, -a)
-    ramp = (a + B) / J
-    v_ramp = _braking(ramp, d, v, a, B, J)[1]
-    end = ramp + v_ramp / B if v_ramp > 0.0 else (a + math.sqrt(a * a + 2.0 * J * v)) / J
-    # phi* rises as long as 2 d v + k a / M > 0, which ends once, on the ramp or after it: bisection, then Newton. On a
-    # brake that ends behind the surface (d < 0) phi0 takes over.
-    corner = min(ramp, end)
+def _peak(d: float, v: float, a: float, M: float, B: float, J: float, corner: float, end: float, index: Index) -> float:
+    """Largest phi* on the brake; corner: where the ramp is over.
+
+    phi* rises as long as 2 d v + k a / M > 0, which ends once, on the ramp or after it: bisection, then Newton. On a
+    brake that ends behind the surface (d < 0) phi0 takes over.
+    """
+    k = index.k
     d_t, v_t, a_t = _braking(corner, d, v, a, B, J)
     after = 2.0 * max(d_t, 0.0) * v_t + k * a_t / M > 0.0
     early, late = (corner, end) if after else (0.0, corner)
@@ -129,65 +152,77 @@ def psi(
         newton = i >= SEARCHES and curve < 0.0
         t = min(late, max(early, t - slope / curve)) if newton else 0.5 * (early + late)
     d_t, v_t, _ = _braking(t, d, v, a, B, J)
-    return max(now, phi_star(max(d_t, 0.0), v_t, M, d_min, k), d_min - _braking(end, d, v, a, B, J)[0])
+    return phi_star(max(d_t, 0.0), v_t, M, index.d_min, k)
+
+
+@njit(cache=True)
+def psi(d: float, v: float, a: float, M: float, M_dot: float, J: float, index: Index) -> float:
+    """Largest phi on the hardest brake from (d, v, a); see above. M is taken as it will be at the end of the ramp."""
+    now = phi(d, v, max(index.M_floor, M), index)
+    square = a * a + 2.0 * J * v
+    if v < 0.0:  # retreating: the approach begins, if ever, where v = 0
+        if a <= 0.0 or square <= 0.0:
+            return now
+        d = _braking((a - math.sqrt(square)) / J, d, v, a, 0.0, J)[0]
+        v, a = 0.0, math.sqrt(square)
+    if index.kind == PHI_STAR:
+        M = M + min(0.0, M_dot) * max(0.0, a + BRAKE_SHARE * M) / J
+    M = max(index.M_floor, M)
+    B = max(BRAKE_SHARE * M if index.kind == PHI_STAR else min(index.brake, BRAKE_SHARE * M), -a)
+    ramp = (a + B) / J
+    v_ramp = _braking(ramp, d, v, a, B, J)[1]
+    end = ramp + v_ramp / B if v_ramp > 0.0 else (a + math.sqrt(a * a + 2.0 * J * v)) / J
+    least = index.d_min - _braking(end, d, v, a, B, J)[0]
+    if index.kind == PHI_B:  # constant while braking at `brake`, and it rises before that: greatest where it ends
+        return max(now, least)
+    return max(now, least, _peak(d, v, a, M, B, J, min(ramp, end), end, index))
 
 
 @njit(cache=True)
 def _psi_after(
-    u: float,
-    d: float,
-    v: float,
-    a: float,
-    T: float,
-    M: float,
-    M_dot: float,
-    J: float,
-    d_min: float,
-    k: float,
-    M_floor: float,
+    u: float, d: float, v: float, a: float, T: float, M: float, M_dot: float, J: float, index: Index
 ) -> float:
     """psi one period later if the approach acceleration goes from a to u."""
-    return psi(
-        d - T * v - T * T * (2.0 * a + u) / 6.0,
-        v + T * (a + u) / 2.0,
-        u,
-        M + T * min(0.0, M_dot),
-        M_dot,
-        J,
-        d_min,
-        k,
-        M_floor,
-    )
+    ahead = d - T * v - T * T * (2.0 * a + u) / 6.0
+    fall = T * min(0.0, M_dot) if index.kind == PHI_STAR else 0.0
+    return psi(ahead, v + T * (a + u) / 2.0, u, M + fall, M_dot, J, index)
 
 
 @njit(cache=True)
 def greatest_approach(
-    d: float,
-    v: float,
-    a: float,
-    T: float,
-    M: float,
-    M_dot: float,
-    J: float,
-    d_min: float,
-    k: float,
-    eta: float,
-    M_floor: float,
-    most: float,
+    d: float, v: float, a: float, T: float, M: float, M_dot: float, J: float, index: Index, most: float
 ) -> float:
-    """Greatest approach acceleration after the coming period that keeps the row, m/s2; `most`: all there can be."""
-    target = max(0.0, psi(d, v, a, M, M_dot, J, d_min, k, M_floor) * (1.0 - eta * T))
+    """Greatest approach acceleration after the coming period that keeps the row, m/s2; `most`: all there can be; inf:
+    all of it keeps the row.
+
+    For most pairs one psi tells. For the others a bracketed secant search (Illinois), which ends at its safe side.
+    """
+    over = _psi_after(most, d, v, a, T, M, M_dot, J, index)
+    if over <= 0.0:
+        return np.inf
+    target = max(0.0, psi(d, v, a, M, M_dot, J, index) * (1.0 - index.eta * T))
     low, high = -4.0 * M - abs(a) - 10.0, most
-    if _psi_after(high, d, v, a, T, M, M_dot, J, d_min, k, M_floor) <= target:
-        return high
-    if _psi_after(low, d, v, a, T, M, M_dot, J, d_min, k, M_floor) > target:
+    over -= target
+    if over <= 0.0:
+        return np.inf
+    under = _psi_after(low, d, v, a, T, M, M_dot, J, index) - target
+    if under > 0.0:
         return low
-    for _ in range(SHARPNESS):
-        middle = 0.5 * (low + high)
-        if _psi_after(middle, d, v, a, T, M, M_dot, J, d_min, k, M_floor) <= target:
-            low = middle
+    weight_low, weight_high, last = under, over, 0
+    for i in range(SEARCH_MOST):
+        if high - low <= SHARPNESS or under >= -CLOSE:
+            break
+        share = weight_low / (weight_low - weight_high)
+        middle = low + (share if i % 2 == 0 and 0.0 < share < 1.0 else 0.5) * (high - low)
+        value = _psi_after(middle, d, v, a, T, M, M_dot, J, index) - target
+        if value <= 0.0:
+            low, under, weight_low = middle, value, value
+            weight_high *= 0.5 if last < 0 else 1.0
+            last = -1
         else:
-            high = middle
+            high, weight_high = middle, value
+            weight_low *= 0.5 if last > 0 else 1.0
+            last = 1
     return low
 
 
@@ -204,82 +239,138 @@ def approach_ending(v: float, a: float, T: float, J: float) -> float:
     return half - math.sqrt(half * half + 2.0 * J * s)
 
 
+class Effect(NamedTuple):
+    """What the control can do to one pair in the coming period, m/s2, and the jerk that the index counts on, m/s3."""
+
+    along: float  # C ddq: of the commanded acceleration
+    least: float  # of C u within the joint bounds of this period
+    most: float
+    jerk: float
+
+
+@njit(cache=True)
+def _effect(C: Vector, ddq: Vector, dddq_max: Vector, lower: Vector, upper: Vector) -> Effect:
+    along = jerk = most = least = 0.0
+    for j in range(ddq.shape[0]):
+        along += C[j] * ddq[j]
+        most += max(C[j] * lower[j], C[j] * upper[j])
+        least += min(C[j] * lower[j], C[j] * upper[j])
+        jerk += JERK_SHARE * abs(C[j]) * dddq_max[j]
+    return Effect(along, least, most, jerk)
+
+
+@njit(cache=True)
+def _is_near(d: float, v: float, v_robot: float, index: Index, brake_time: float) -> bool:
+    """The approach has used up the distance before the joint-space brake is over."""
+    return d - index.d_min < max(v, v_robot) * brake_time
+
+
+@njit(cache=True)
+def free_pairs(
+    pairs: Separation,
+    ddq: Vector,
+    dddq_max: Vector,
+    lower: Vector,
+    upper: Vector,
+    T: float,
+    index: Index,
+    brake_time: float,
+) -> BoolVector:
+    """Pairs whose row no control of this period can break, whatever M is (Basis FREE): exact, and M is not needed.
+
+    psi falls with M (where the pair retreats, its sign does not depend on M), and never takes less than the floor. With
+    M under its floor there is a row only near.
+    """
+    free = np.empty(pairs.d.shape[0], np.bool_)
+    for i in range(free.shape[0]):
+        d, v, v_robot = pairs.d[i], -pairs.d_dot[i], -pairs.d_dot_robot[i]
+        e = _effect(pairs.C[i], ddq, dddq_max, lower, upper)
+        free[i] = v <= index.v_max and e.jerk > NO_JERK and not _is_near(d, v, v_robot, index, brake_time)
+        if free[i]:
+            hardest, a = -(e.least + pairs.drift[i]), -(e.along + pairs.drift[i])
+            free[i] = _psi_after(hardest, d, v, a, T, index.M_floor, 0.0, e.jerk, index) <= 0.0
+    return free
+
+
+@njit(cache=True)
+def _base(basis: int, floor: float, e: Effect) -> float:
+    """What is left of a floor where rows conflict, see safe_control: all of an index row; of the end of an approach
+    half of what it asks beyond the commanded acceleration; of a ramp, the commanded braking less WEAKEN of what a
+    period can take from it."""
+    if basis == INDEX:
+        return floor
+    if basis == STANDSTILL:
+        return min(floor, e.along + STANDSTILL_BASE * (floor - e.along))
+    return min(floor, e.along - max(SLACKEN, WEAKEN * (e.along - e.least)))
+
+
 @njit(cache=True)
 def row_floors(
     pairs: Separation,
+    free: BoolVector,
     M: Vector,
     M_dot: Vector,
     ddq: Vector,
     dddq_max: Vector,
     lower: Vector,
     upper: Vector,
+    brake: Vector,
     T: float,
-    d_min: float,
-    k: float,
-    eta: float,
-    M_floor: float,
+    index: Index,
     brake_time: float,
-) -> tuple[Vector, Vector, Vector, IntVector]:
-    """(phi, floor, base, Basis) of every pair: the row is C u >= floor; base: see safe_control.
+) -> tuple[Vector, Vector, Vector, IntVector, IntVector]:
+    """(phi, floor, base, Basis, Outside) of every pair: the row is C u >= floor; base: see safe_control.
 
-    lower, upper: the joint bounds of this period.
+    free: see `free_pairs`. lower, upper: the joint bounds of this period. brake: control of the joint-space brake, and
+    how long it takes, s.
 
-    M under its floor: phi* is not defined, the control hardly reaches this direction and the link hardly moves along it
-    (Basis M_FLOOR). Then the pair has no row as long as the joint-space brake (`brake_time`, s) is over before the
-    approach has used up the distance; nearer, the approach has to end.
+    Outside the ranges of its certificate the index is not relied on alone; the fallback is the same for all of them:
+    near, the robot's own approach has to end. M under its floor: phi* is not defined, the control hardly reaches this
+    direction and the link hardly moves along it; farther away there is no row at all, and near it asks for no more than
+    the joint-space brake gives. (A column that turns fast is carried to and fro by its drift alone; asked to end that,
+    the first joint, which hardly moves it, was driven on to 1.5 times its speed.)
     """
     p = M.shape[0]
-    value, floor, base, basis = np.empty(p), np.empty(p), np.empty(p), np.empty(p, np.int64)
+    value, floor, base = np.empty(p), np.empty(p), np.empty(p)
+    basis, outside = np.empty(p, np.int64), np.zeros(p, np.int64)
     for i in range(p):
-        along = J = most = least = 0.0
-        for j in range(ddq.shape[0]):
-            along += pairs.C[i, j] * ddq[j]
-            most += max(pairs.C[i, j] * lower[j], pairs.C[i, j] * upper[j])
-            least += min(pairs.C[i, j] * lower[j], pairs.C[i, j] * upper[j])
-            J += JERK_SHARE * abs(pairs.C[i, j]) * dddq_max[j]
-        within = (along + JERK_SHARE * (most - along) if most > along else most) - SLACKEN
-        d, v, v_robot = pairs.d[i], -pairs.d_dot[i], -pairs.d_dot_robot[i]
-        value[i] = phi(d, v, max(M[i], M_floor), d_min, k)
-        creep = min(STANDSTILL_SPEED, max(STANDSTILL_LEAST, STANDSTILL_FADE * (d - d_min)))
-        standstill = -approach_ending(v_robot - creep, -(along + pairs.drift_robot[i]), T, J) - pairs.drift_robot[i]
-        if M[i] <= M_floor or J <= NO_JERK:
-            basis[i] = M_FLOOR
-            near = d - d_min < max(v, v_robot) * brake_time
-            floor[i] = min(standstill, within) if near else NO_ROW
-            base[i] = min(floor[i], along - SLACKEN)
+        e = _effect(pairs.C[i], ddq, dddq_max, lower, upper)
+        within = (e.along + JERK_SHARE * (e.most - e.along) if e.most > e.along else e.most) - SLACKEN
+        d, v, v_robot, drift = pairs.d[i], -pairs.d_dot[i], -pairs.d_dot_robot[i], pairs.drift[i]
+        value[i] = phi(d, v, max(M[i], index.M_floor), index)
+        outside[i] = OUTSIDE_DISTANCE * (d < index.d_min) + OUTSIDE_SPEED * (v > index.v_max)
+        if free[i]:
+            floor[i], base[i], basis[i] = NO_ROW, NO_ROW, FREE
             continue
-        a = -(along + pairs.drift[i])
-        most_approach = -(least + pairs.drift[i])
-        index = (
-            -greatest_approach(d, v, a, T, M[i], M_dot[i], J, d_min, k, eta, M_floor, most_approach) - pairs.drift[i]
-        )
-        if d < d_min:  # not even towards a person who gives way
-            index = max(index, standstill)
-        ramp = min(within, BRAKE_SHARE * M[i] - pairs.drift[i])
-        floor[i], basis[i] = index, INDEX
-        if standstill < floor[i]:
+        near = _is_near(d, v, v_robot, index, brake_time)
+        creep = min(STANDSTILL_SPEED, max(STANDSTILL_LEAST, STANDSTILL_FADE * (d - index.d_min)))
+        own = -approach_ending(v_robot - creep, -(e.along + pairs.drift_robot[i]), T, e.jerk)
+        standstill = own - pairs.drift_robot[i]
+        if M[i] <= index.M_floor or e.jerk <= NO_JERK:
+            basis[i], outside[i] = M_FLOOR, outside[i] + OUTSIDE_RADIUS
+            braked = np.sum(pairs.C[i] * brake) - SLACKEN
+            floor[i] = min(standstill, within, braked) if near else NO_ROW
+            base[i] = _base(M_FLOOR, floor[i], e)
+            continue
+        a, hardest = -(e.along + drift), -(e.least + drift)
+        asked = max(NO_ROW, -greatest_approach(d, v, a, T, M[i], M_dot[i], e.jerk, index, hardest) - drift)
+        if d < index.d_min or (near and v > index.v_max):  # inside d_min not even towards a person who gives way
+            asked = max(asked, standstill)
+        ramp = min(within, BRAKE_SHARE * M[i] - drift)
+        floor[i], basis[i] = asked, INDEX
+        if standstill <= floor[i]:
             floor[i], basis[i] = standstill, STANDSTILL
         if ramp < floor[i]:
             floor[i], basis[i] = ramp, RAMP
-        base[i] = min(floor[i], along - SLACKEN) if basis[i] == RAMP else floor[i]
-    return value, floor, base, basis
+        base[i] = _base(basis[i], floor[i], e)
+    return value, floor, base, basis, outside
 
 
 @njit(cache=True)
-def phi_rate(
-    pairs: Separation,
-    M: Vector,
-    M_dot: Vector,
-    achieved: Vector,
-    d_min: float,
-    k: float,
-) -> Vector:
-    """phi_dot under the control that is sent, C u = achieved: the derivative of whichever of phi0, phi* is larger."""
-    rate = np.empty(M.shape[0])
-    for i in range(M.shape[0]):
-        d, d_dot = pairs.d[i], pairs.d_dot[i]
-        rate[i] = -d_dot
-        if M[i] > 0.0 and phi_star(d, -d_dot, M[i], d_min, k) > d_min - d:
-            d_ddot = achieved[i] + pairs.drift[i]
-            rate[i] = -2.0 * abs(d) * d_dot - k * d_ddot / M[i] + k * d_dot * M_dot[i] / (M[i] * M[i])
-    return rate
+def phi_rate(d: float, d_dot: float, d_ddot: float, M: float, M_dot: float, index: Index) -> float:
+    """phi_dot: the derivative of whichever part of phi is the larger."""
+    if index.kind == PHI_B:
+        return -d_dot + min(0.0, d_dot) * d_ddot / index.brake
+    if M > 0.0 and phi_star(d, -d_dot, M, index.d_min, index.k) > index.d_min - d:
+        return -2.0 * abs(d) * d_dot - index.k * d_ddot / M + index.k * d_dot * M_dot / (M * M)
+    return -d_dot

@@ -13,9 +13,6 @@ import ruckig
 from asc_rt.core.system import System
 from asc_rt.core.types import CoreState, Vector, vector
 
-# Rounding of (u - ddq) / T must not make the exact profile look too fast.
-ROUNDING = 1.0 + 1e-6
-
 
 @dataclass(frozen=True, slots=True)
 class SetPoint:
@@ -32,8 +29,8 @@ class SmoothingError(Exception):
 def smooth(system: System, state: CoreState, u: Vector) -> SetPoint:
     """The set-point one period on. Raises SmoothingError."""
     T = system.params.period
-    target = [v + T * (a + b) / 2.0 for v, a, b in zip(state.dq_cmd, state.ddq_cmd, u, strict=True)]
-    return profile(system, state, target, u.tolist(), minimum_duration=T)
+    target = state.dq_cmd + T * (state.ddq_cmd + u) / 2.0
+    return profile(system, state, target.tolist(), u.tolist(), minimum_duration=T)
 
 
 def profile(
@@ -44,7 +41,6 @@ def profile(
     minimum_duration: float | None = None,
 ) -> SetPoint:
     """One period along Ruckig's profile from the commanded state to the speed dq and the acceleration ddq."""
-    r = system.params.robot
     request = ruckig.InputParameter(system.n)
     request.control_interface = ruckig.ControlInterface.Velocity
     request.synchronization = ruckig.Synchronization.No
@@ -53,8 +49,7 @@ def profile(
     request.current_acceleration = state.ddq_cmd.tolist()
     request.target_velocity = dq
     request.target_acceleration = ddq
-    request.max_acceleration = [ROUNDING * a for a in r.ddq_max]
-    request.max_jerk = [ROUNDING * j for j in r.dddq_max]
+    request.max_acceleration, request.max_jerk = system.smoothing_limits
     if minimum_duration is not None:
         request.minimum_duration = minimum_duration
         request.synchronization = ruckig.Synchronization.Time
@@ -66,4 +61,4 @@ def profile(
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise SmoothingError(str(result))
     q, v, a = plan.at_time(system.params.period)
-    return SetPoint(vector(q), vector(v), vector(a), vector([0.0] * system.n))
+    return SetPoint(vector(q), vector(v), vector(a), system.zero)

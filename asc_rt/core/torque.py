@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
+from asc_rt.core import polytope
 from asc_rt.core.brake import at_rest
 from asc_rt.core.dynamics import inertia_and_bias
 from asc_rt.core.kinematics import forward
-from asc_rt.core.polytope import Polytope
 from asc_rt.core.realizable import with_torque
+from asc_rt.core.robot_model import unpack
 from asc_rt.core.safe_control import project
 from asc_rt.core.smoothing import SetPoint, SmoothingError
 from asc_rt.core.system import System
-from asc_rt.core.types import CoreState, CycleInputs, Vector, vector
+from asc_rt.core.types import CoreState, CycleInputs, Matrix, StopReason, Vector, frozen
 
 REST_SPEED = 0.01  # ASSUMED, rad/s: slower than this the arm is held where it is
 # ASSUMED: reference towards a goal, 1/s: speed per distance and acceleration per speed error. Critically damped at 4:1.
@@ -25,9 +27,16 @@ HOLD_DAMPING = 60.0
 
 def reference(system: System, state: CoreState) -> Vector:
     """u = SPEED_RATE (dq_ref - dq), dq_ref = GOAL_RATE (q_goal - q), all joints slowed alike to the task's speed."""
-    wish = GOAL_RATE * (state.goal.q - state.q_cmd)
-    most = float(np.max(np.abs(wish) / (system.params.task.speed * system.bounds.dq_max)))
-    return vector(SPEED_RATE * (wish / max(1.0, most) - state.dq_cmd))
+    task = system.params.task
+    speed = task.speed if state.slow is StopReason.NONE else min(task.speed, task.slow_speed)
+    fastest = speed * system.bounds.dq_max
+    return frozen(_towards(state.goal.q, state.q_cmd, state.dq_cmd, fastest))
+
+
+@njit(cache=True)
+def _towards(goal: Vector, q: Vector, dq: Vector, fastest: Vector) -> Vector:
+    wish = GOAL_RATE * (goal - q)
+    return SPEED_RATE * (wish / max(1.0, np.max(np.abs(wish) / fastest)) - dq)
 
 
 def stop(system: System, state: CoreState, x: CycleInputs) -> SetPoint:
@@ -39,24 +48,35 @@ def stop(system: System, state: CoreState, x: CycleInputs) -> SetPoint:
     q, dq = (x.joint.q, x.joint.dq) if x.joint is not None else (state.q_cmd, state.dq_cmd)
     hold = HOLD_STIFFNESS * (state.q_cmd - q) - HOLD_DAMPING * dq
     wish = hold if at_rest(state) else -dq / (4.0 * T)
-    U = with_torque(system.model.arm, forward(system.model.chain, q, dq), -b.ddq_max, b.ddq_max)
+    U = _brakes(system.model.packed, q, dq)
     u = project(np.clip(wish, -b.ddq_max, b.ddq_max), U, b.ddq_max)
     if u is None:
         raise SmoothingError("no torque within the limits brakes the arm")
     point = set_point(system, q, dq, u)
     if at_rest(state):
-        zero = vector(np.zeros(system.n))
-        return SetPoint(state.q_cmd, zero, zero, point.tau)
+        return SetPoint(state.q_cmd, system.zero, system.zero, point.tau)
     return point
 
 
 def set_point(system: System, q: Vector, dq: Vector, u: Vector) -> SetPoint:
-    H, h = inertia_and_bias(forward(system.model.chain, q, dq), system.model.arm.bodies)
-    T = system.params.period
-    tau = (H * u).sum(axis=1) + h
-    return SetPoint(vector(q + T * dq), vector(dq + T * u), vector(u), vector(tau))
+    return SetPoint(*frozen(_set_point(system.model.packed, q, dq, u, system.params.period)))
 
 
-def command_set(system: System, q: Vector, dq: Vector, lower: Vector, upper: Vector) -> Polytope:
-    """This period's controls: the joint box and the torque limits, if the arm has them."""
-    return with_torque(system.model.arm, forward(system.model.chain, q, dq), lower, upper)
+@njit(cache=True)
+def _set_point(packed: Vector, q: Vector, dq: Vector, u: Vector, T: float) -> Matrix:
+    """(q, dq) one period on, u and tau = H u + h, (4, n)."""
+    arm, n = unpack(packed), u.shape[0]
+    H, h = inertia_and_bias(forward(arm.chain, q, dq), arm.bodies)
+    point = np.empty((4, n))
+    for i in range(n):
+        point[0, i], point[1, i], point[2, i], point[3, i] = q[i] + T * dq[i], dq[i] + T * u[i], u[i], h[i]
+        for j in range(n):
+            point[3, i] += H[i, j] * u[j]
+    return point
+
+
+@njit(cache=True)
+def _brakes(packed: Vector, q: Vector, dq: Vector) -> Matrix:
+    """The controls that a stop may use, as a packed polytope."""
+    arm = unpack(packed)
+    return polytope.pack(with_torque(arm, forward(arm.chain, q, dq), -arm.bounds.ddq_max, arm.bounds.ddq_max))

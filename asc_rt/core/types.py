@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +16,22 @@ import numpy.typing as npt
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
 IntVector = npt.NDArray[np.int64]
+IntMatrix = npt.NDArray[np.int64]
+BoolVector = npt.NDArray[np.bool_]
 
-MAX_CAPSULES = 20  # of all people together, in one HumanState; one more is a fault, never a silent cut
+MAX_CAPSULES = 20  # of all people together, from all sensors; one more is a fault, never a silent cut
 MAX_PAIRS = 32  # pairs written into one record: the nearest ones (the QP always takes all active pairs)
 
 
 def vector(values: object) -> Vector:
     """A read-only float64 copy of `values`."""
     array = np.array(values, dtype=np.float64, order="C")
+    array.setflags(write=False)
+    return array
+
+
+def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """`array` itself, read-only from now on; for arrays that nobody else holds."""
     array.setflags(write=False)
     return array
 
@@ -49,7 +58,7 @@ class JointState:
     dq: Vector  # (n,) rad/s
     current: Vector  # (n,) A, motor currents (torque-controlled arms: Nm)
     flags: RobotFlag
-    tool_id: int  # as the robot tells it; 0 = it tells none: the cell's tool; -1 = it should, and has not yet
+    tool_id: int  # as the changer tells it (0: it is empty), -1: not told yet; 0 from a robot that tells of no tool
     dq_is_estimated: bool  # True: differenced from q by the driver
 
 
@@ -86,6 +95,32 @@ class HumanState:
     visibility: IntVector  # (m,) Visibility
 
 
+class MessageFault(IntEnum):
+    """Why a message of a sensor was refused; NONE again after some good ones. See human_ladder and sensor_mail."""
+
+    NONE = 0
+    UNREADABLE = 1  # no HumanState, or a number in it that cannot be
+    ORDER = 2  # sequence or capture stamp did not increase: duplicated, reordered, or two publishers
+    SENDER = 3  # of another sensor, or one that claims to be safety rated
+    SCHEMA = 4  # of another version
+    CLOCK = 5  # stamped by a clock that is not ours
+
+
+@dataclass(frozen=True, slots=True)
+class SensorReport:
+    """What one expected sensor last said of itself, and how it came. Where its people are is in the HumanState."""
+
+    id: int
+    seq: int  # of its newest good message; 0: none has come yet
+    age_ns: int  # of the capture; below 0: stamped ahead of us
+    sigma_ns: int  # how far the capture stamp may be off our clock
+    fault: MessageFault
+    health: Health
+    coverage: float
+    calibration_hash: int
+    says_nothing: bool  # no capsules, and not certified that nobody is there
+
+
 @dataclass(frozen=True, slots=True)
 class Goal:
     id: int  # increases; a goal with the id of the present one changes nothing
@@ -96,12 +131,14 @@ class EventKind(IntEnum):
     ARM = 1
     STOP = 2
     END = 3  # end the session: brake, say goodbye to the robot, leave
+    TOOL = 4  # a person says which tool is mounted; heard at rest, where the robot does not tell it
 
 
 @dataclass(frozen=True, slots=True)
 class OperatorEvent:
     id: int  # increases, so that a repeated message counts once
     kind: EventKind
+    tool: int = 0  # TOOL: number of the mount
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +150,9 @@ class CycleInputs:
     t_ns: int
     period_ns: int
     joint: JointState | None
-    human: HumanState | None  # newest message; the same one again until a newer arrives
+    human: HumanState | None  # what all sensors together see, newest messages; the same until a newer arrives
     human_age_ns: int  # t_ns - t_capture_ns; 0 without a message
-    human_fault: bool  # a message came that could not be decoded or ran backwards
+    sensors: tuple[SensorReport, ...]  # every expected one, in the order of the parameters
     goal: Goal | None
     events: tuple[OperatorEvent, ...]
     missed_ticks: int  # samples of the robot lost since the last cycle
@@ -148,21 +185,37 @@ class StopReason(IntEnum):
     HUMAN_MISSING = 3
     HUMAN_STALE = 4
     HUMAN_UNHEALTHY = 5
-    HUMAN_INVALID = 6
-    INFEASIBLE = 7
-    START_INSIDE = 8  # armed while a person was already too close
-    LATE = 9
-    TRACKING = 10  # the robot does not follow its set-points
-    GATE = 11
-    EXCEPTION = 12  # a defect of the controller itself
-    ROBOT_NOT_READY = 13
-    ROBOT_SILENT = 14
-    ROBOT_FAULTED = 15
+    HUMAN_COVERAGE = 6  # a sensor sees too little of the guarded volume
+    HUMAN_UNSYNCED = 7  # how far a sensor's clock is off is not known well enough
+    HUMAN_INVALID = 8
+    TOOL_CHANGED = 9  # the tool was changed while the robot moved
+    TOOL_UNKNOWN = 10  # the robot should tell which tool it carries, and has not yet
+    TOOL_MISMATCH = 11  # it carries another tool than the cell knows, or a heavier or lighter one
+    TOOL_UNCERTIFIED = 12  # no certificate covers the tool that it carries
+    INFEASIBLE = 13
+    START_INSIDE = 14  # armed while a person was already too close
+    LATE = 15
+    SEPARATION = 16  # nearer than the protective separation distance, where the cell enforces it
+    HUMAN_SCHEMA = 17  # a sensor speaks another version of the message
+    HUMAN_CLOCK = 18  # a sensor stamps with another clock, or ahead of it
+    HUMAN_CALIBRATION = 19  # a sensor is calibrated otherwise than the cell says
+    TRACKING = 20  # the robot does not follow its set-points
+    GATE = 21
+    EXCEPTION = 22  # a defect of the controller itself
+    ROBOT_NOT_READY = 23
+    ROBOT_SILENT = 24
+    ROBOT_FAULTED = 25
 
     @property
     def is_fault(self) -> bool:
         """Faults end the session; the other reasons wait for a person to arm again."""
-        return self >= StopReason.TRACKING
+        return self >= StopReason.HUMAN_SCHEMA
+
+    @property
+    def is_of_people(self) -> bool:
+        """What is known of people is not good enough."""
+        waits = StopReason.HUMAN_MISSING <= self <= StopReason.HUMAN_INVALID
+        return waits or StopReason.HUMAN_SCHEMA <= self <= StopReason.HUMAN_CALIBRATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +225,7 @@ class CoreState:
     tick: int
     mode: Mode
     reason: StopReason
+    slow: StopReason  # why the task runs at its slow speed; NONE: it does not
     q_cmd: Vector  # (n,) rad, set-point last sent
     dq_cmd: Vector  # (n,) rad/s
     ddq_cmd: Vector  # (n,) rad/s2
@@ -180,6 +234,7 @@ class CoreState:
     event_id: int  # of the last operator event handled
     silent_cycles: int
     ending: bool  # the session ends once the robot is at rest
+    tool: int  # index of the mount whose model, capsules and limits are decided with
 
 
 # --- what is decided -------------------------------------------------------------------------------------------------
@@ -200,6 +255,16 @@ class Basis(IntEnum):
     STANDSTILL = 1
     RAMP = 2  # the person comes faster than the robot can make good: brake as fast as the arm can
     M_FLOOR = 3  # the control hardly reaches this direction
+    FREE = 4  # no control of this period can break the row, whatever M is: M and M_dot were not evaluated and are 0
+
+
+class Outside(IntFlag):
+    """Where a pair is outside the ranges that its index was certified on. Near the person the approach has to end."""
+
+    NOTHING = 0
+    DISTANCE = 1  # d < d_min
+    SPEED = 2  # the approach is faster than v_max
+    RADIUS = 4  # M at or under its floor
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,11 +277,28 @@ class Pairs:
     d_dot: Vector  # (p,) m/s, worst case within the velocity bound
     M: Vector  # (p,) m/s2, one-sided radius of the realizable set
     M_dot: Vector  # (p,) m/s3, numeric
-    phi: Vector  # (p,) max(phi0, phi*)
+    phi: Vector  # (p,) max(phi0, phi*); if M was not evaluated with M at its floor: no less than the true one
     phi_dot: Vector  # (p,) of the control that is sent
     floor: Vector  # (p,) m/s2, least C u that the row allows
     achieved: Vector  # (p,) m/s2, C u of the control that is sent
     basis: IntVector  # (p,) Basis of the floor
+    outside: IntVector  # (p,) Outside
+
+
+@dataclass(frozen=True, slots=True)
+class Monitor:
+    """Speed and separation monitoring in ISO's terms, of the measured robot; see separation_monitor."""
+
+    distance: float  # m, to where the person was seen; inf: nobody is there
+    protective_distance: float  # m, S_p
+    robot_speed: float  # m/s, v_r
+    age: float  # s, T_a, of the oldest sensor, clock error included
+    reaction_time: float  # s, T_r
+    stopping_time: float  # s, T_s
+
+    @property
+    def is_kept(self) -> bool:
+        return self.distance >= self.protective_distance
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,8 +310,10 @@ class SafetyDecision:
     pairs: Pairs
     pair_count: int  # active pairs, also those beyond MAX_PAIRS
     iterations: int  # of the solver
-    share: float  # of the ramp that was possible where rows conflict; 1 otherwise
+    share: float  # of the braking that was possible where rows conflict; 1 otherwise
     d_measured: float  # m, smallest separation distance of the *measured* robot; inf: no pair
+    d_goal: float  # m, the same of the robot at its goal: under d_min it waits until the person makes way; inf: no pair
+    monitor: Monitor | None  # None: no sample of the robot, or no data of people
 
 
 class CommandKind(IntEnum):

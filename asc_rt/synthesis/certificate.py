@@ -166,13 +166,21 @@ def covers(certificate: Certificate, params: Params) -> list[str]:
     out += _weaker(c.limits, p.robot)
     for wrong, text in (
         (c.control != p.control, f"it is for {c.control} control, the cell has {p.control} control"),
-        (c.index is not Index.PHI_STAR, f"it is for index {c.index}, the cell uses {Index.PHI_STAR}"),
-        (c.k is not None and s.k < c.k, f"safety.k = {s.k:g} is under the certified {c.k or 0.0:g}"),
+        (c.index != s.index, f"it is for index {c.index}, the cell uses {s.index}"),
+        (
+            c.k is not None and c.index is Index.PHI_STAR and s.k < c.k,
+            f"safety.k = {s.k:g} is under the certified {c.k or 0.0:g}",
+        ),
+        (
+            c.k is not None and c.index is Index.PHI_B and s.brake > c.k,
+            f"safety.brake_m_s2 = {s.brake:g} is above the certified {c.k or 0.0:g}",
+        ),
         (not _same(s.d_min, c.d_min), f"safety.d_min_m = {s.d_min:g}, certified for {c.d_min:g}"),
         (
             s.activation_distance > r.d_high,
             f"safety.activation_m = {s.activation_distance:g} is beyond the certified range, d up to {r.d_high:g} m",
         ),
+        (s.v_max > r.v_max, f"safety.v_max_m_s = {s.v_max:g} is above the certified {r.v_max:g}"),
         (s.M_floor < c.M_floor, f"safety.M_floor = {s.M_floor:g} is under the certified {c.M_floor:g}"),
         (s.eta > c.eta, f"safety.eta = {s.eta:g} is above the certified {c.eta:g}"),
         (

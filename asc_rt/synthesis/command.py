@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 if TYPE_CHECKING:
-    from asc_rt.core.params import RobotParams
+    from asc_rt.core.params import Params, RobotParams, ToolParams
     from asc_rt.synthesis.certify import Request, Result
 
 Show = Callable[[dict[str, Any], bool], None]
@@ -91,7 +91,7 @@ def register(app: typer.Typer, show: Show, refuse: Refuse) -> None:
 
 def make_request(robot: str | None, tool: str | None, control: str | None, cell: str | None, **given: Any) -> Request:
     """The request of a command line. RangeError, ConfigError."""
-    from asc_rt.config import load_arm, load_cell
+    from asc_rt.config import load_cell
     from asc_rt.synthesis.certificate import Index
     from asc_rt.synthesis.certify import Request
     from asc_rt.synthesis.sampling import RangeError, Ranges
@@ -106,7 +106,7 @@ def make_request(robot: str | None, tool: str | None, control: str | None, cell:
     if given["links"] not in ("tool", "all"):
         raise RangeError(f"--links: {given['links']!r} is unknown; tool or all")
     _check_numbers(given)
-    arm, held = load_arm(robot or (base.robot.name if base else ""), tool or (base.tool.name if base else ""))
+    arm, held = _arm_and_tool(robot, tool, base)
     level = control or (base.control if base else "acceleration")
     if given["torque_box"] and level != "torque":
         raise RangeError("--torque-box: needs --control torque")
@@ -132,6 +132,16 @@ def make_request(robot: str | None, tool: str | None, control: str | None, cell:
         return request
     k = base.safety.k if request.k is None and request.index is Index.PHI_STAR else request.k
     return replace(request, M_floor=base.safety.M_floor, eta=base.safety.eta, period=base.period, k=k)
+
+
+def _arm_and_tool(robot: str | None, tool: str | None, base: Params | None) -> tuple[RobotParams, ToolParams]:
+    """By their names, or the cell's; a tool that only the cell has is the sphere around its tools."""
+    from asc_rt.config import load_arm
+
+    mounts = {mount.tool.name: mount.tool for mount in base.changer.mounts} if base else {}
+    if base and robot in (None, base.robot.name) and tool in mounts:
+        return load_arm(base.robot.name, base.tool.name)[0], mounts[tool]
+    return load_arm(robot or (base.robot.name if base else ""), tool or (base.tool.name if base else ""))
 
 
 def _told_limits(robot: RobotParams, recording: Path) -> RobotParams:
@@ -182,6 +192,7 @@ def summary(result: Result, file: Path) -> dict[str, Any]:
         "index": c.index.value,
         "samples": s.samples,
         "seconds": round(result.seconds, 3),
+        "cpu_seconds": round(result.cpu_seconds, 3),
         "M_min": s.M_min,
         "M_max": s.M_max,
         "M_ball_min": s.ball_min,

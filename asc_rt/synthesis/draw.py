@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from asc_rt.core.abstraction import People, _place
+from asc_rt.core.abstraction import People, place
 from asc_rt.core.kinematics import forward
 from asc_rt.core.robot_model import Arm
 from asc_rt.core.types import Matrix, Vector
@@ -78,9 +78,9 @@ def realise(arm: Arm, draw: Draw, unit: Vector) -> State:
 def _beside(arm: Arm, q: Vector, capsule: int, d: float, along: float, angle: float, out: Vector) -> None:
     """The point at distance d of the capsule's surface."""
     motion = forward(arm.chain, q, np.zeros(q.shape[0]))
-    p0, p1, axis = np.empty(3), np.empty(3), np.array((0.0, 0.0, 1.0))
-    _place(motion, arm.capsules.joint[capsule], arm.capsules.p0[capsule], p0)
-    _place(motion, arm.capsules.joint[capsule], arm.capsules.p1[capsule], p1)
+    p0 = np.array(place(motion, arm.capsules.joint[capsule], arm.capsules.p0[capsule]))
+    p1 = np.array(place(motion, arm.capsules.joint[capsule], arm.capsules.p1[capsule]))
+    axis = np.array((0.0, 0.0, 1.0))
     length = math.sqrt((p1[0] - p0[0]) ** 2 + (p1[1] - p0[1]) ** 2 + (p1[2] - p0[2]) ** 2)
     if length > 1e-9:
         axis = (p1 - p0) / length

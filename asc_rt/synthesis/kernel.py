@@ -17,12 +17,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from asc_rt.core.abstraction import JUMP, People, _pair, _place
+from asc_rt.core.abstraction import People, distance, pair, place
 from asc_rt.core.dynamics import inertia_and_bias, inverse
 from asc_rt.core.gradient import drift_gradient, support_gradient
 from asc_rt.core.kinematics import Motion, cross, forward
 from asc_rt.core.limits import acceleration_box
-from asc_rt.core.polytope import Polytope, Support, support
+from asc_rt.core.polytope import Polytope, Support, moved, support
+from asc_rt.core.radius import JUMP
 from asc_rt.core.robot_model import Arm
 from asc_rt.core.types import Vector
 
@@ -59,10 +60,11 @@ class Situation(NamedTuple):
 def situation(arm: Arm, limited: bool, people: People, q: Vector, dq: Vector, capsule: int) -> Situation:
     motion = forward(arm.chain, q, dq)
     n, joint = q.shape[0], arm.capsules.joint[capsule]
-    r0, r1, C = np.empty(3), np.empty(3), np.empty(n)
-    _place(motion, joint, arm.capsules.p0[capsule], r0)
-    _place(motion, joint, arm.capsules.p1[capsule], r1)
-    d, d_dot, drift, own, _ = _pair(motion, joint, r0, r1, arm.capsules.radius[capsule], people, 0, 0.0, C)
+    C = np.empty(n)
+    r0 = np.array(place(motion, joint, arm.capsules.p0[capsule]))
+    r1 = np.array(place(motion, joint, arm.capsules.p1[capsule]))
+    d = distance(r0, r1, arm.capsules.radius[capsule], people, 0)
+    d_dot, drift, own, _ = pair(motion, joint, r0, r1, people, 0, 0.0, C)
     G, low, high, unlimited = np.zeros((0, n)), np.zeros(0), np.zeros(0), np.zeros((0, 0))
     if arm.effort.shape[0] > 0:
         H, h = inertia_and_bias(motion, arm.bodies)
@@ -97,23 +99,7 @@ def best(c: Vector, s: Situation) -> Support:
 @njit(cache=True, nogil=True)
 def change(here: Situation, there: Situation, sign: float, at: Support) -> float:
     """Change of sign (drift + C u) at its best vertex and multipliers, from one situation to another nearby."""
-    n = here.C.shape[0]
-    change = sign * (there.drift - here.drift)
-    for i in range(n):
-        change += sign * (there.C[i] - here.C[i]) * at.u[i]
-        y = at.y[i]
-        if y > 0.0:
-            change += y * (there.U.upper[i] - here.U.upper[i])
-        elif y < 0.0:
-            change += y * (there.U.lower[i] - here.U.lower[i])
-    for r in range(at.y.shape[0] - n):
-        y = at.y[n + r]
-        if y == 0.0:
-            continue
-        change += y * (there.U.high[r] - here.U.high[r]) if y > 0.0 else y * (there.U.low[r] - here.U.low[r])
-        for k in range(n):
-            change -= y * (there.U.G[r, k] - here.U.G[r, k]) * at.u[k]
-    return change
+    return sign * (there.drift - here.drift) + moved(at, sign * here.C, here.U, sign * there.C, there.U)
 
 
 @njit(cache=True, nogil=True)

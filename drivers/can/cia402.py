@@ -1,7 +1,7 @@
 """CiA 402 drives on CANopen: power states, cyclic objects and their scales. Pure; SDO is not in here.
 
 Cyclic frames of an axis, both transmitted with SYNC and full to the last byte:
-RPDO1 = controlword 6040h, target position 607Ah, target torque 6071h; TPDO1 = statusword 6041h, actual position 6064h,
+RPDO1 = controlword 6040h, target position 607Ah, torque offset 60B2h; TPDO1 = statusword 6041h, actual position 6064h,
 actual torque 6077h. The mode of operation says which target counts. A drive applies an RPDO at the next SYNC and tells
 the effect at the one after: answers are waited for in cycles.
 """
@@ -17,7 +17,7 @@ from fractions import Fraction
 from drivers.base import ProtocolError
 
 NMT_ID, SYNC_ID, EMCY_BASE, TPDO1_BASE, RPDO1_BASE, HEARTBEAT_BASE = 0x000, 0x080, 0x080, 0x180, 0x200, 0x700
-RPDO1_MAP = (0x6040_0010, 0x607A_0020, 0x6071_0010)
+RPDO1_MAP = (0x6040_0010, 0x607A_0020, 0x60B2_0010)
 TPDO1_MAP = (0x6041_0010, 0x6064_0020, 0x6077_0010)
 SYNC_TYPE = 1  # transmission type: each SYNC
 _PDO = struct.Struct("<Hih")
@@ -123,6 +123,10 @@ class Scale:
         """ValueError: not finite, or beyond 32 bits."""
         value = _finite("position", q) * self.counts_per_radian + self.zero
         return _fits("position", round(value), 32)
+
+    def counts_per_second(self, dq: float) -> int:
+        """ValueError: not finite, or beyond 32 bits."""
+        return _fits("velocity", round(_finite("velocity", dq) * self.counts_per_radian), 32)
 
     def radians(self, counts: int) -> float:
         return (counts - self.zero) / self.counts_per_radian

@@ -16,7 +16,7 @@ from drivers.base import ProtocolError
 
 REGISTER_ID = 0x7FF
 KP_MAX, KD_MAX = 500.0, 5.0  # Nm/rad, Nms/rad
-_READ, _WRITE = 0x33, 0x55
+_READ, _WRITE, _REFRESH = 0x33, 0x55, 0xCC
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +157,11 @@ def decode_answer(motor: MotorType, command_id: int, data: bytes) -> Answer:
         power_stage_c=data[6],
         coil_c=data[7],
     )
+
+
+def refresh(command_id: int) -> bytes:
+    """Sent to REGISTER_ID; answered like a command, without being one."""
+    return struct.pack("<HBBI", command_id, _REFRESH, 0, 0)
 
 
 def read_register(command_id: int, register: Register) -> bytes:

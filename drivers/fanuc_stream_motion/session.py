@@ -148,6 +148,7 @@ class Session:
             period_ns=NOMINAL_PERIOD_NS,
             identity=self._identity,
             limits=self._guard.joint_limits(self._rounding, NOMINAL_PERIOD_NS * 1e-9),
+            tells_tool=self._common.window is not None,
         )
 
     def activate(self, period_ns: int) -> JointState:
@@ -385,8 +386,8 @@ class Session:
         packet = self._decode(data)
         return (packet.seq, packet.q, packet.current) if isinstance(packet, Status) else None
 
-    def encode_set_point(self, seq: int, q: Vector, last: bool) -> bytes:
-        return self._encode(seq, q, last)
+    def encode_command(self, seq: int, command: JointCommand) -> bytes:
+        return self._encode(seq, command.q, command.is_last)
 
     def _drain(self) -> None:
         """Throw away what an earlier session left in the socket."""

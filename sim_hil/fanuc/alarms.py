@@ -18,6 +18,7 @@ class Alarm:
 
 
 UNREACHABLE = Alarm("MOTN-018", "Position not reachable")
+CONFIGURATION = Alarm("MOTN-156", "configuration change")
 SEQUENCE = Alarm("MOTN-601", "ST: Sequence No. error")
 DRY = Alarm("MOTN-603", "ST: Receiving interval over")
 VERSION = Alarm("MOTN-607", "ST: Protocol version mismatch")

@@ -136,6 +136,20 @@ class Arm:
             q = q - np.clip(np.linalg.lstsq(slope, error)[0], -_NEWTON_STRIDE, _NEWTON_STRIDE)
         return None
 
+    def configuration(self, q: Array) -> Array:
+        """(3,) wrist, elbow, shoulder: how far each is from where it turns over. Poses of one configuration have equal
+        signs: sin J5 (no flip, flip); the forearm against the upper arm (up, down); the wrist before or behind J1."""
+        rotation, place, places = np.eye(3), np.zeros(3), []
+        for angle, (origin, axis) in zip(q, self.joints, strict=True):
+            place = place + rotation @ np.array(origin)
+            places.append(place)
+            rotation = rotation @ _turn(axis, float(angle))
+        shoulder, elbow, wrist = places[1], places[2], places[4]
+        front = np.array([math.cos(q[0]), math.sin(q[0]), 0.0])
+        across = np.array([math.sin(q[0]), -math.cos(q[0]), 0.0])
+        bend = float(across @ np.cross(elbow - shoulder, wrist - elbow))
+        return np.array([math.sin(q[4]), bend, float(front @ wrist)])
+
     def _miss(self, q: Array, target: tuple[Array, Array]) -> Array:
         """How far off the face plate is: (6,) m and rad."""
         rotation, place = self._frame(q)

@@ -46,6 +46,7 @@ class Cabinet:
         self.offences: list[Offence] = []
         self.pendant_enabled = False
         self._plant = plant
+        self.couple(s.tool)
         brake = np.full(len(plant.q), math.radians(s.brake_deg_s2))
         self._servo = Servo(plant.q, s.period, s.filter_cycles, s.lag_ms * 1e-3, brake)
         self._limits = LimitCheck(self.arm.tables, s.payload_share, s.period, self._flange_mm)
@@ -145,6 +146,12 @@ class Cabinet:
     @property
     def time_stamp(self) -> int:
         return (int(self._cycles * self.settings.period_ms) + self._clock_jump_ms) // 2 * 2 % 2**32
+
+    def couple(self, tool: int) -> None:
+        """Another tool in the changer (0: none): its number on the signals, its body on the flange."""
+        self.signals.couple(tool)
+        if (carry := getattr(self._plant, "carry", None)) is not None:
+            carry(tool)
 
     @property
     def currents(self) -> Array:

@@ -112,6 +112,7 @@ class Controller(Cabinet):
         self._expected: int | None = None
         self._newest: Array | None = None
         self._style = wire.JOINT
+        self._configuration = self.arm.configuration(self._plant.q)  # which poses must keep
 
     def _pass_ibgn_end(self) -> None:
         self._enter_ibgn()
@@ -177,6 +178,8 @@ class Controller(Cabinet):
             self._offend(rule, data)
         elif q is None:
             self._alarm(alarms.UNREACHABLE, data)
+        elif packet["data_style"] != wire.JOINT and np.any(self._configuration * self.arm.configuration(q) < 0.0):
+            self._alarm(alarms.CONFIGURATION, data)
         elif (alarm := self._check(packet, q)) is not None:
             self._alarm(alarm, data)
         else:

@@ -6,12 +6,12 @@ A `FaultyController` is a controller for whoever drives it. Script entries: {at_
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
+from sim_hil import fault_script
 from sim_hil.fanuc.cabinet import Cabinet, Peer
 from sim_hil.fanuc.signals import IDENTITY_BITS
 
@@ -60,33 +60,10 @@ class Fault:
         return fault
 
 
-def read_script(path: Path) -> list[Fault]:
-    """The [[faults]] of a TOML file. ValueError: it cannot be read, or one of them is none; one line each."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: malformed TOML: {error}") from error
-    if set(table) != {"faults"}:
-        raise ValueError(f"{path}: [[faults]] and nothing else is wanted, each with {', '.join(_KEYS)}")
-    return parse_script(table["faults"], str(path))
-
-
-def parse_script(entries: object, where: str) -> list[Fault]:
-    """ValueError: one line for each entry that is no fault."""
-    script, wrong = [], []
-    for number, entry in enumerate(entries if isinstance(entries, list) else [entries], 1):
-        try:
-            script.append(Fault.parse(entry))
-        except ValueError as error:
-            wrong.append(f"{where}: fault {number}: {error}")
-    if wrong:
-        raise ValueError("\n".join(wrong))
-    return script
-
-
-_KEYS = tuple(field.name for field in fields(Fault))
+parse_script = partial(fault_script.parse, kind=Fault)
+read_script = partial(fault_script.read, kind=Fault)
+heard = partial(fault_script.heard, kind=Fault)
+_KEYS = fault_script.keys(Fault)
 
 
 class _Due(NamedTuple):
@@ -184,7 +161,7 @@ class FaultyController:
             case "clock":
                 robot.jump_clock(value)
             case "tool":
-                robot.signals.couple(value)
+                robot.couple(value)
             case "power_off":
                 self._powered = False
             case _:

@@ -6,7 +6,6 @@ Exit code 0 after SIGTERM or SIGINT, 1 in strict mode with offences or without a
 from __future__ import annotations
 
 import argparse
-import signal
 import socket
 import sys
 import time
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from asc_rt import realtime
+from asc_rt import launch, realtime
 from asc_rt.bus import BusError
 from asc_rt.config import Cell, ConfigError, load_cell
 from sim_hil.fanuc import wire, wire_b
@@ -24,7 +23,7 @@ from sim_hil.fanuc.arm import KinematicPlant, Plant
 from sim_hil.fanuc.cabinet import Cabinet, Peer
 from sim_hil.fanuc.controller import Controller
 from sim_hil.fanuc.controller_b import ControllerB
-from sim_hil.fanuc.faults import Fault, FaultyController, parse_script, read_script
+from sim_hil.fanuc.faults import Fault, FaultyController, heard, parse_script, read_script
 from sim_hil.fanuc.rmi_sockets import RmiSockets
 from sim_hil.fanuc.settings import Settings
 from sim_hil.world import World
@@ -35,6 +34,7 @@ MAX_PACKETS = 64  # of one cycle: a flood must not stop the controller's time
 
 Publish = Callable[[int], None]
 Poll = Callable[[], None]
+TakeFault = Callable[[], bytes | None]
 
 
 CLASSIC, ROS = "fanuc-j519", "fanuc-stream-motion-b"  # drivers whose robot is simulated here
@@ -45,23 +45,21 @@ RMI_PORT = 16001
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim_hil fanuc", description=__doc__.splitlines()[0])
     parser.add_argument("cell", help="cell file or name of a cell")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="put over the cell file")
+    launch.add_overrides(parser)
     parser.add_argument("--strict", action="store_true", help="exit code 1 if the PC broke the protocol")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="TOML with [[faults]], added to the cell's")
     parser.add_argument(
         "--plant", choices=("mujoco", "kinematic"), default="mujoco", help="kinematic: no dynamics, no person, no bus"
     )
     args = parser.parse_args(argv)
-    stop: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda signum, _: stop.append(signum))
+    stop = launch.told_to_end()
     with ExitStack() as stack:
         try:
             cell = load_cell(args.cell, args.set)
             settings, script = _settings(cell)
             script += read_script(args.faults) if args.faults else []
             link = stack.enter_context(_bind(cell))
-            plant, publish = _plant(cell, settings, args.plant, stack)
+            plant, publish, take_fault = _plant(cell, settings, args.plant, stack)
             controller: Cabinet
             if cell.driver["name"] == ROS:
                 controller = ControllerB(plant, settings)
@@ -74,7 +72,8 @@ def main(argv: list[str]) -> int:
             return _fail(error, 2)
         except BusError as error:
             return _fail(f"{error}; {error.hint}", 1)
-        return _run(link, controller, script, (poll, publish), stop, args.strict)
+        device = FaultyController(controller, script)
+        return _run(link, device, (_both(poll, device, take_fault), publish), stop, args.strict)
 
 
 def _settings(cell: Cell) -> tuple[Settings, list[Fault]]:
@@ -108,27 +107,41 @@ def _rmi(cell: Cell, controller: ControllerB) -> RmiSockets:
         raise ValueError(f"cannot listen on {host}:{port} and {port + 1}: {error.strerror}") from None
 
 
-def _plant(cell: Cell, settings: Settings, kind: str, stack: ExitStack) -> tuple[Plant, Publish | None]:
+def _both(poll: Poll | None, device: FaultyController, take_fault: TakeFault | None) -> Poll:
+    """Once in each cycle: the sockets of RMI, and the faults that come over the bus."""
+
+    def both() -> None:
+        if poll is not None:
+            poll()
+        for fault in heard(take_fault) if take_fault is not None else ():
+            device.inject(fault.fault, fault.count, fault.value)
+
+    return both
+
+
+def _plant(
+    cell: Cell, settings: Settings, kind: str, stack: ExitStack
+) -> tuple[Plant, Publish | None, TakeFault | None]:
     q0 = np.radians(settings.start_deg)
     if kind == "kinematic":
-        return KinematicPlant(q0, settings.period), None
-    world = World(cell, q0)
+        return KinematicPlant(q0, settings.period), None, None
+    world = World(cell, "fanuc", q0)
     stack.callback(world.close)
-    return world, world.publish
+    return world, world.publish, world.take_fault
 
 
 def _run(
     link: socket.socket,
-    controller: Cabinet,
-    script: list[Fault],
-    others: tuple[Poll | None, Publish | None],
+    device: FaultyController,
+    others: tuple[Poll, Publish | None],
     stop: list[int],
     strict: bool,
 ) -> int:
     for line in realtime.set_up(PRIORITY, None)["missing"]:
         print(f"fanuc: less punctual, it lacks {line}", file=sys.stderr)
     print("ready fanuc {}:{}".format(*link.getsockname()), flush=True)
-    cycles, skipped = serve(link, controller, script, others, stop)
+    cycles, skipped = serve(link, device, others, stop)
+    controller = device.controller
     alarms = ", ".join(str(alarm) for alarm in controller.alarms) or "none"
     offences = len(controller.offences)
     print(f"fanuc: {cycles} cycles, {skipped} skipped, {offences} offences, alarms: {alarms}", flush=True)
@@ -137,13 +150,12 @@ def _run(
 
 def serve(
     link: socket.socket,
-    controller: Cabinet,
-    script: list[Fault],
-    others: tuple[Poll | None, Publish | None],
+    device: FaultyController,
+    others: tuple[Poll, Publish | None],
     stop: list[int],
 ) -> tuple[int, int]:
     """Run until `stop` is not empty; (cycles run, periods skipped). Missed periods are lost time, never a burst."""
-    device, (poll, publish) = FaultyController(controller, script), others
+    controller, (poll, publish) = device.controller, others
     period_ns = round(controller.settings.period_ms * 1e6)
     cycles = skipped = told = 0
     due_ns = time.monotonic_ns() + period_ns
@@ -156,8 +168,7 @@ def serve(
         for peer, data in device.cycle(_drain(link)):
             with suppress(OSError):  # to a PC that went away or does not read it is lost, as on a cable
                 link.sendto(data, peer)
-        if poll is not None:
-            poll()
+        poll()
         if publish is not None:
             publish(time.monotonic_ns())
         for offence in controller.offences[told:]:

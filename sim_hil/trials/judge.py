@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from asc_rt.core.system import System
-from asc_rt.core.types import CoreState, CycleOutputs, Mode, Status
+from asc_rt.core.types import Basis, CoreState, CycleOutputs, Mode, Status
 from sim_hil.plant import MujocoPlant
 
 APPROACHING = 0.01  # m/s: a robot slower than this does not approach
+PROFILE_S = 0.1  # s between the distances that are kept
+FAR = 9.99  # m: nobody is there
 TOLERANCE = 1e-6  # of a limit, for rounding
 
 
@@ -33,17 +35,22 @@ class Outcome:
     M_max: float
     M_dot_star: float  # m/s3, fastest fall of M met
     end: str  # mode and reason at the end
+    tool_distance: float  # m, least, of what the arm carries (its last link, if nothing) to person or obstacle
+    distances: tuple[float, ...]  # m, the same every PROFILE_S
+    tools: tuple[str, ...]  # that it carried, one after the other
     notes: tuple[str, ...]  # each robot-caused event, stop and fault, with its time
 
 
 class Judge:
     def __init__(self, system: System, plant: MujocoPlant) -> None:
         self._system, self._plant = system, plant
+        self._distances: list[float] = []
+        self._tools: list[str] = [plant.tool]
         self._effort = np.array(system.params.robot.effort or ())
         self._inside = self._guilty = False
         self._exceeded: set[str] = set()
         self._notes: list[str] = []
-        self.min_distance = np.inf
+        self.min_distance = self._tool_distance = np.inf
         self.violations = self.robot_caused = self.infeasible = self.stops = self.filtered = 0
         self._speed = self._torque = 0.0
         self._M = [np.inf, -np.inf]
@@ -51,9 +58,17 @@ class Judge:
 
     def look(self, t: float) -> None:
         """At the true state: distance, approach, limits."""
-        nearest, b = self._plant.distance(), self._system.bounds
+        d_min, b = self._system.params.safety.d_min, self._system.bounds
+        nearest = self._plant.distance(approach_within=d_min)
         self.min_distance = min(self.min_distance, nearest.distance)
-        inside = nearest.distance < self._system.params.safety.d_min
+        of_tool = self._plant.tool_distance(nearest)
+        self._tool_distance = min(self._tool_distance, of_tool)
+        if t >= PROFILE_S * len(self._distances):
+            self._distances.append(round(min(of_tool, FAR), 4))
+        if self._plant.tool != self._tools[-1]:
+            self._tools.append(self._plant.tool)
+            self._notes.append(f"{t:.3f} s carries {self._plant.tool}, {nearest.distance * 1e3:.0f} mm away")
+        inside = nearest.distance < d_min
         guilty = inside and nearest.approach > APPROACHING
         self.violations += inside and not self._inside
         if guilty and not self._guilty:
@@ -81,9 +96,11 @@ class Judge:
         if before.mode is Mode.ACTIVE and after.mode is not Mode.ACTIVE:
             self.stops += 1
             self._notes.append(f"{t:.3f} s {after.mode.name} {after.reason.name}")
-        if len(pairs.M) and after.mode is Mode.ACTIVE:
-            self._M = [min(self._M[0], float(pairs.M.min())), max(self._M[1], float(pairs.M.max()))]
-            self._fall = max(self._fall, float(-pairs.M_dot.min()))
+        evaluated = pairs.basis != Basis.FREE
+        if after.mode is Mode.ACTIVE and np.any(evaluated):
+            M, fall = pairs.M[evaluated], -pairs.M_dot[evaluated]
+            self._M = [min(self._M[0], float(M.min())), max(self._M[1], float(M.max()))]
+            self._fall = max(self._fall, float(fall.max()))
 
     def outcome(self, t: float, cycles: int, state: CoreState, reached: int, reachable: bool) -> Outcome:
         return Outcome(
@@ -104,5 +121,8 @@ class Judge:
             M_max=self._M[1],
             M_dot_star=self._fall,
             end=f"{state.mode.name} {state.reason.name}",
+            tool_distance=float(self._tool_distance),
+            distances=tuple(self._distances),
+            tools=tuple(self._tools),
             notes=tuple(self._notes),
         )

@@ -72,6 +72,7 @@ class Camera:
     def __init__(self, world: World, quality: Quality, seed: int) -> None:
         self._world, self._quality, self._seed = world, quality, seed
         self._newest: tuple[int, HumanState] | None = None
+        self._late: dict[int, float] = {}  # s, by frame
 
     def at(self, t: float) -> tuple[HumanState, float] | None:
         frame = int(t * self._quality.rate)
@@ -85,7 +86,9 @@ class Camera:
 
     def _arrival(self, frame: int) -> float:
         low, high = self._quality.latency
-        return frame / self._quality.rate + low + (high - low) * self._random(frame).random()
+        if frame not in self._late:
+            self._late[frame] = low + (high - low) * float(self._random(frame).random())
+        return frame / self._quality.rate + self._late[frame]
 
     def _capture(self, frame: int) -> HumanState:
         q, t = self._quality, frame / self._quality.rate
@@ -113,7 +116,7 @@ def message(seq: int, t: float, people: Capsules, position_bound: float, velocit
     m = len(people.radius)
     return HumanState(
         t_capture_ns=round(t * 1e9),
-        seq=seq,
+        seq=seq + 1,  # 0 says that no message has come yet
         sensor_id=1,
         calibration_hash=0,
         health=Health.OK,

@@ -36,6 +36,7 @@ class TrialSystem:
     d_min: float = 0.05  # m
     activation: float = 0.8  # m
     human_acceleration: float = 0.0  # m/s2
+    v_max: float = 1.0  # m/s, the paper's
 
     @property
     def name(self) -> str:
@@ -60,8 +61,15 @@ class TrialSystem:
             robot=robot,
             tool=tool,
             safety=SafetyParams(
-                self.d_min, self.activation, self.k, 1.0, 0.3, self.human_acceleration, 1.5 * self.d_min
+                d_min=self.d_min,
+                activation_distance=self.activation,
+                k=self.k,
+                eta=1.0,
+                M_floor=0.3,
+                human_acceleration=self.human_acceleration,
+                rearm_distance=1.5 * self.d_min,
+                v_max=self.v_max,
             ),
-            human=HumanParams(AGE_LIMIT_NS, FUTURE_LIMIT_NS, calibration_hash=0),
+            human=HumanParams(AGE_LIMIT_NS, AGE_LIMIT_NS, FUTURE_LIMIT_NS),
             task=TaskParams(speed=0.5, goal_tolerance=0.01),
         )

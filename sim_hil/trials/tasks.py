@@ -11,6 +11,7 @@ from sim_hil.person import Array
 from sim_hil.trials.planner import Planner
 
 PROGRESS = 0.02  # rad nearer to the target, or it is no progress
+CLOSER = 0.1  # rad: what an arm that is not held makes within a tenth of a second
 PATIENCE = 1.0  # s without progress
 NEAR = 0.1  # rad: near enough to a pose on the way
 BRANCHES = 600  # per attempt
@@ -43,6 +44,35 @@ class Rounds:
 
     def reached(self, state: CoreState) -> int:
         return state.reached_id
+
+
+class Shift:
+    """Goals in turn; one that has not come CLOSER within `patience` s is left for the next: to creep is no progress."""
+
+    def __init__(self, goals: Array, patience: float) -> None:
+        self._goals, self._patience = goals, patience
+        self._id, self._count = 1, 0
+        self._best, self._since = np.inf, 0.0
+
+    is_over = False
+
+    def goal(self, t: float, state: CoreState, q: Array) -> Goal:
+        left = float(np.max(np.abs(self._goals[self._id % len(self._goals)] - q)))
+        if state.reached_id >= self._id:
+            self._count += 1
+            self._next(t)
+        elif left < self._best - CLOSER:
+            self._best, self._since = left, t
+        elif t - self._since > self._patience:
+            self._next(t)
+        return Goal(self._id, vector(self._goals[self._id % len(self._goals)]))
+
+    def reached(self, state: CoreState) -> int:
+        return self._count
+
+    def _next(self, t: float) -> None:
+        self._id += 1
+        self._best, self._since = np.inf, t
 
 
 class Visit:

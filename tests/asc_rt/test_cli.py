@@ -71,7 +71,7 @@ def test_every_fault_of_a_cell_is_told(asc: Any) -> None:
     assert len(err) == 2 and all(line.startswith("error: ") for line in err)
 
 
-@pytest.mark.parametrize("words", [["nonsense"], ["sim", "camera"], ["run", "--nonsense"], ["bench", "nothing"]])
+@pytest.mark.parametrize("words", [["nonsense"], ["sim", "toaster"], ["run", "--nonsense"], ["bench", "nothing"]])
 def test_bad_usage_is_exit_code_2(asc: Any, words: list[str]) -> None:
     code, out, err = asc(*words)
     assert code == 2 and out == "" and any("Error" in line for line in err)
@@ -123,9 +123,9 @@ def test_bench_step_has_its_rows(asc: Any, monkeypatch: pytest.MonkeyPatch) -> N
     code, out, _ = asc("bench", "step", "--json")
     told = json.loads(out)
     assert code == 0 and told["machine"]
-    parts = [(part, n, kind) for part in ("pairs", "rows_qp") for n in (1, 10, 50) for kind in ("median", "p99")]
+    parts = [(part, n, kind) for part in ("pairs", "free", "whole") for n in (1, 10, 50) for kind in ("median", "p99")]
     assert [row["name"] for row in told["rows"]] == ["_".join(map(str, p)) for p in parts] + ["start", "start_memory"]
-    assert all(row["unit"] == "us" for row in told["rows"][:12])
+    assert all(row["unit"] == "us" for row in told["rows"][:18])
     assert all(row["value"] > 0 and row["ratio"] > 0 for row in told["rows"])
 
 

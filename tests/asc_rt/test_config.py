@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from asc_rt import config
 from asc_rt.config import CELLS, ConfigError, load_cell, what_if
 from asc_rt.core.params import Params
+from calibration import result as calibration
 
 
 def faults(cell: str | Path = "fanuc-sim", *overrides: str) -> tuple[str, ...]:
@@ -107,6 +108,8 @@ def test_the_goals_of_the_cell_are_clear_of_the_mounting_plane() -> None:
         ("safety.d_min_m=100", ["safety.d_min_m", "100 m", "unit"]),
         ("safety.k=nan", ["safety.k", "nan", "not a finite number"]),
         ("safety.eta=inf", ["safety.eta", "inf", "not a finite number"]),
+        ("safety.k=0.6", ["safety.k", "0.6", "1"]),
+        ("safety.v_max_m_s=0", ["safety.v_max_m_s", "0", "0.01"]),
         ("safety.k='3'", ["safety.k", "'3'", "a number"]),
         ("human.age_limit_ms=true", ["human.age_limit_ms", "True", "ms"]),
         ("human.age_limit_ms=0.2", ["human.age_limit_ms", "0.2 ms", "10 to 1000 ms"]),
@@ -121,6 +124,12 @@ def test_the_goals_of_the_cell_are_clear_of_the_mounting_plane() -> None:
         ("driver.prt=1", ["driver", "'prt'", "port"]),
         ("driver.version=9", ["driver", "version", "9"]),
         ("bus.endpoint=127.0.0.1", ["bus.endpoint", "tcp/127.0.0.1:17447"]),
+        ("bus.endpoint=tcp/0.0.0.0:17447", ["bus.endpoint", "0.0.0.0", "127.0.0.1", "[bus.remote]"]),
+        ("bus.remote.endpoint=tcp/10.0.0.1:5", ["bus.remote.endpoint", "tcp/10.0.0.1:5"]),
+        ("human.slow_age_ms=201", ["human.slow_age_ms", "201 ms", "at most human.age_limit_ms = 200 ms"]),
+        ("human.slow_coverage=0.5", ["human.slow_coverage", "0.5", "at least human.least_coverage = 0.7"]),
+        ('human.sensors=["a","a"]', ["human.sensors", "a, a", "each once"]),
+        ("human.calibrations.persn=x.json", ["human.calibrations.persn", "did you mean 'person'?"]),
         ("task.goals_deg=[]", ["task.goals_deg", "0 values"]),
         ("task.goals_deg=[[1, 2]]", ["task.goals_deg[0]", "2 angles", "6 joints"]),
         ("task.goals_deg=[[171, 0, 0, 0, 0, 0]]", ["task.goals_deg[0][0]", "171 deg", "J1", "-170 to 170 deg"]),
@@ -167,10 +176,10 @@ def test_only_a_simulated_cell_may_run_uncertified() -> None:
     assert any("uncertified: this cell is real" in line for line in lines)
 
 
-def test_a_real_cell_has_neither_ground_truth_nor_simulated_devices() -> None:
+def test_a_real_cell_has_no_ground_truth() -> None:
     lines = faults("fanuc-sim", "simulated=false")
     assert any("ground-truth" in line for line in lines)
-    assert any(": sim: " in line for line in lines)
+    assert not any(": sim: " in line for line in lines), "what it is rehearsed with may stay in its file"
 
 
 PROFILE = "robots/lrmate_200id/profile.toml"
@@ -229,3 +238,54 @@ def test_what_if_changes_what_is_asked_and_nothing_else() -> None:
 def test_what_if_refuses_what_it_cannot_do(change: str) -> None:
     with pytest.raises(ConfigError):
         what_if(load_cell("fanuc-sim").params, [change])
+
+
+# --- a cell that sees ------------------------------------------------------------------------------------------------
+
+SEEING = "fanuc-sim-seeing"
+
+
+def test_the_messages_of_cameras_carry_the_hash_of_all_their_calibrations(files: Path) -> None:
+    before = load_cell(SEEING)
+    assert before.perception is not None
+    digest = before.perception.digest
+    assert before.params.human.sensors[0].calibration_hash == int.from_bytes(digest[:8], "big") != 0
+    left = files / "cells" / SEEING / "left.json"
+    dataclasses.replace(calibration.read(left), operator="somebody else").save(left)
+    after = load_cell(SEEING).perception
+    assert after is not None and after.digest != digest
+
+
+def test_a_calibration_that_must_not_be_used_is_refused_with_the_cell(files: Path) -> None:
+    folder = files / "cells" / SEEING
+    good = calibration.read(folder / "left.json")
+    for changed, said in [
+        (dataclasses.replace(good, reasons=("chi2",)), "accepted"),
+        (dataclasses.replace(good, valid_until="2020-01-01"), "expired"),
+    ]:
+        changed.save(folder / "left.json")
+        (line,) = faults(SEEING)
+        assert "perception.camera.left.calibration" in line and said in line
+    good.save(folder / "left.json")
+    spoil(folder / "left.json", '"hand-eye"', '"eye-hand"')
+    (folder / "right.json").unlink()
+    assert [key in line for key, line in zip(("left", "right"), faults(SEEING), strict=True)] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ("human.calibration=ground-truth", "human.calibration"),
+        ("perception.sensor=other", "perception.sensor"),
+        ("perception.high=[1, 1, -1]", "perception.high"),
+        ("perception.camera.left.device.port=0", "perception.camera.left.device"),
+        ("perception.camera.left.device.name=kinect", "perception.camera.left.device"),
+        ("perception.voxel_m=50", "perception.voxel_m"),
+    ],
+)
+def test_what_is_wrong_with_the_cameras_is_one_line_with_its_key(change: str, key: str) -> None:
+    assert [line for line in faults(SEEING, change) if f": {key}" in line]
+
+
+def test_cameras_without_a_perception_table_are_nobodys(files: Path) -> None:
+    assert "human.calibration" in faults("fanuc-sim", "human.calibration=cameras")[0]

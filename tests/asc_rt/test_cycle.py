@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -30,6 +29,7 @@ from asc_rt.inputs import Mail
 from asc_rt.pacing import DevicePaced
 from asc_rt.record import Timings
 from drivers.base import LinkError, WriteReceipt
+from tests.box import Box
 
 PERIOD = 8_000_000
 
@@ -80,21 +80,13 @@ class Bench:
         self.records.append(record)  # type: ignore[arg-type]
 
 
-class Box:
-    def __init__(self, *waiting: bytes) -> None:
-        self.waiting = deque(waiting)
-
-    def take(self) -> bytes | None:
-        return self.waiting.popleft() if self.waiting else None
-
-
 @pytest.fixture(scope="module")
 def system() -> System:
     return System(load_cell("fanuc-sim").params)
 
 
 def run(system: System, bench: Bench, operator: Box | None = None) -> CoreState:
-    mail = Mail(Box(), operator or Box(), Box(), joints=system.n, clock="test")
+    mail = Mail({1: Box()}, operator or Box(), Box(), joints=system.n, clock="test")
     return cycle.run(system, bench, mail, bench, DevicePaced(PERIOD, bench), bench)  # type: ignore[arg-type]
 
 

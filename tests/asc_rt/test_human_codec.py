@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asc_rt import human_state_pb2 as pb
-from asc_rt.core.types import MAX_CAPSULES, Health, Visibility
+from asc_rt.core.types import MAX_CAPSULES, Health, MessageFault, Visibility
 from asc_rt.human_codec import HumanCodecError, clock_id, decode
 
 CLOCK = "HOST_MONO:test"
@@ -38,8 +38,9 @@ def one(**changes: object) -> pb.HumanState:
 
 
 def test_everything_arrives() -> None:
-    state, session = decode(message().SerializeToString(), CLOCK)
-    assert session == "s"
+    heard = decode(message().SerializeToString(), CLOCK)
+    state = heard.state
+    assert (heard.session, heard.sigma_ns) == ("s", 0)
     assert (state.t_capture_ns, state.seq, state.sensor_id) == (123, 5, 7)
     assert state.calibration_hash == 0x0001020304050607
     assert state.health is Health.DEGRADED and state.coverage == 0.9 and not state.empty_certified
@@ -52,7 +53,7 @@ def test_everything_arrives() -> None:
 
 
 def test_nobody_is_an_empty_state_of_the_right_shapes() -> None:
-    state, _ = decode(message(bodies=[], empty_certified=True).SerializeToString(), CLOCK)
+    state = decode(message(bodies=[], empty_certified=True).SerializeToString(), CLOCK).state
     assert state.p0.shape == state.v1.shape == (0, 3) and state.radius.shape == (0,)
     assert state.empty_certified
 
@@ -65,7 +66,8 @@ BAD: dict[str, Callable[[], pb.HumanState]] = {
     "calibration hash": lambda: message(calibration_hash=b"short"),
     "unknown health": lambda: message(health=9),
     "sequence number": lambda: message(seq=0),
-    "capture stamp": lambda: message(t_capture_ns=-1),
+    "capture stamp -1": lambda: message(t_capture_ns=-1),
+    "may be off": lambda: message(t_capture_sigma_ns=2**63),
     "coverage": lambda: message(coverage=1.1),
     "not finite": lambda: one(p0=[float("nan"), 0, 0]),
     "radius or bound is not finite": lambda: one(radius=float("inf")),
@@ -83,6 +85,22 @@ def test_a_bad_message_says_what_is_bad(words: str) -> None:
         decode(BAD[words]().SerializeToString(), CLOCK)
 
 
+FAULTS = {"schema version 2": MessageFault.SCHEMA, "clock": MessageFault.CLOCK, "safety rated": MessageFault.SENDER}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_what_the_decision_is_told_of_a_bad_message(words: str) -> None:
+    with pytest.raises(HumanCodecError) as refused:
+        decode(BAD[words]().SerializeToString(), CLOCK)
+    assert refused.value.fault is FAULTS.get(words, MessageFault.UNREADABLE)
+
+
+def test_a_stamp_that_may_be_off_grows_the_people_by_what_they_move_in_that_time() -> None:
+    heard = decode(message(t_capture_sigma_ns=50_000_000).SerializeToString(), CLOCK)
+    assert heard.sigma_ns == 50_000_000
+    assert heard.state.position_bound == pytest.approx([0.02 + 0.05 * (0.2 + 0.3)] * 2)
+
+
 @given(st.binary(max_size=200))
 def test_foreign_bytes_are_a_typed_error(data: bytes) -> None:
     with pytest.raises(HumanCodecError):
@@ -95,7 +113,7 @@ def test_a_damaged_message_is_an_error_or_a_usable_state(data: st.DataObject) ->
     for _ in range(data.draw(st.integers(1, 3))):
         good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
     try:
-        state, _ = decode(bytes(good[: data.draw(st.integers(0, len(good)))]), CLOCK)
+        state = decode(bytes(good[: data.draw(st.integers(0, len(good)))]), CLOCK).state
     except HumanCodecError:
         return
     assert np.isfinite(state.p0).all() and (state.radius > 0).all() and (state.position_bound >= 0).all()

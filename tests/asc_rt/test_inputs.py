@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import deque
 
 import numpy as np
 import pytest
@@ -11,21 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asc_rt import human_state_pb2 as pb
-from asc_rt.core.types import CycleInputs, EventKind, JointState, RobotFlag, vector
+from asc_rt.core.types import CycleInputs, EventKind, JointState, MessageFault, RobotFlag, vector
 from asc_rt.inputs import MAX_EVENTS, Mail, freeze
 from asc_rt.pacing import DevicePaced
+from asc_rt.sensor_mail import GOOD_AGAIN
+from tests.box import Box
 
 CLOCK = "HOST_MONO:test"
 NOW = 5_000_000_000
 N = 2
-
-
-class Box:
-    def __init__(self) -> None:
-        self.waiting: deque[bytes] = deque()
-
-    def take(self) -> bytes | None:
-        return self.waiting.popleft() if self.waiting else None
+SENSOR = 1
 
 
 class Desk:
@@ -33,12 +27,20 @@ class Desk:
 
     def __init__(self) -> None:
         self.human, self.operator, self.goal = Box(), Box(), Box()
-        self.mail = Mail(self.human, self.operator, self.goal, joints=N, clock=CLOCK)
+        reach = np.full(N, -np.pi), np.full(N, np.pi)
+        self.mail = Mail({SENSOR: self.human}, self.operator, self.goal, joints=N, clock=CLOCK, reach=reach)
         self.pacer = DevicePaced(8_000_000, lambda: NOW)
 
-    def person(self, seq: int, t_ns: int = NOW - 1000, session: str = "a") -> None:
+    def person(self, seq: int, t_ns: int = 0, session: str = "a") -> None:
+        t_ns = t_ns or NOW - 1000 + seq
         message = pb.HumanState(
-            schema_version=1, session_uuid=session, seq=seq, clock_id=CLOCK, t_capture_ns=t_ns, frame_id="robot_base"
+            schema_version=1,
+            sensor_id=SENSOR,
+            session_uuid=session,
+            seq=seq,
+            clock_id=CLOCK,
+            t_capture_ns=t_ns,
+            frame_id="robot_base",
         )
         self.human.waiting.append(message.SerializeToString())
 
@@ -66,7 +68,8 @@ def test_nothing_is_none_and_no_fault(desk: Desk) -> None:
     x = desk.freeze()
     assert (x.tick, x.t_ns, x.period_ns) == (3, NOW, 8_000_000)
     assert x.joint is None and x.human is None and x.goal is None
-    assert (x.human_age_ns, x.human_fault, x.events, x.missed_ticks, x.late) == (0, False, (), 0, False)
+    assert (x.human_age_ns, x.events, x.missed_ticks, x.late) == (0, (), 0, False)
+    assert [(r.id, r.seq, r.fault) for r in x.sensors] == [(SENSOR, 0, MessageFault.NONE)]
 
 
 def test_everything_arrives_at_once(desk: Desk) -> None:
@@ -89,7 +92,7 @@ def test_the_newest_state_stays_until_a_newer_one_comes(desk: Desk) -> None:
     assert desk.freeze().human is desk.freeze().human
     desk.person(2)
     x = desk.freeze()
-    assert x.human is not None and x.human.seq == 2 and not x.human_fault
+    assert x.human is not None and x.human.seq == 2 and not is_faulty(x)
 
 
 def test_a_stamp_ahead_of_us_is_a_negative_age(desk: Desk) -> None:
@@ -97,23 +100,29 @@ def test_a_stamp_ahead_of_us_is_a_negative_age(desk: Desk) -> None:
     assert desk.freeze().human_age_ns == -500
 
 
+def is_faulty(x: CycleInputs) -> bool:
+    return any(report.fault for report in x.sensors)
+
+
 def faulty(desk: Desk) -> CycleInputs:
-    """The fault is seen, stays, keeps the last good state, and goes with the next good message."""
+    """The fault is seen, stays, keeps the last good state, and goes with good messages."""
     good = desk.mail.human
     for x in (desk.freeze(), desk.freeze()):
-        assert x.human_fault
+        assert is_faulty(x)
         assert x.human is good
     assert desk.mail.faults
     return x
 
 
-def test_bytes_that_are_no_state_are_a_fault_until_a_good_one_comes(desk: Desk) -> None:
+def test_bytes_that_are_no_state_are_a_fault_until_good_ones_come(desk: Desk) -> None:
     desk.person(1)
     desk.freeze()
     desk.human.waiting.append(b"\xff\xff")
     faulty(desk)
-    desk.person(2)
-    assert not desk.freeze().human_fault
+    for seq in range(2, 2 + GOOD_AGAIN):
+        assert is_faulty(desk.freeze())
+        desk.person(seq)
+    assert not is_faulty(desk.freeze())
 
 
 @pytest.mark.parametrize("seq", [4, 5])
@@ -135,7 +144,7 @@ def test_a_publisher_may_start_anew_but_two_may_not_take_turns(desk: Desk) -> No
     desk.person(900, NOW - 3000, "a")
     desk.freeze()
     desk.person(1, NOW - 2000, "b")
-    assert not desk.freeze().human_fault
+    assert not is_faulty(desk.freeze())
     desk.person(901, NOW - 1000, "a")
     faulty(desk)
 
@@ -214,6 +223,15 @@ def test_goals_that_are_none_are_noted_and_change_nothing(desk: Desk, number: ob
     assert len(desk.mail.faults) == 1
 
 
+def test_a_goal_out_of_reach_is_noted_with_the_figure(desk: Desk) -> None:
+    desk.aim(1, [0.5, -0.5])
+    assert desk.freeze().goal is not None
+    desk.aim(2, [0.5, 3.2])
+    x = desk.freeze()
+    assert x.goal is not None and x.goal.id == 1
+    assert list(desk.mail.faults) == ["goal message: joint 2 at 183.346 deg is out of reach; -180 to 180 deg"]
+
+
 @pytest.mark.parametrize("text", ['{"id": 1, "q": [NaN, 0]}', '{"id": 1, "q": [0, Infinity]}', "[]", "null", "{"])
 def test_numbers_that_json_should_not_have_are_refused(desk: Desk, text: str) -> None:
     desk.goal.waiting.append(text.encode())
@@ -228,7 +246,7 @@ def test_whatever_arrives_freeze_returns_and_arms_nothing(human: bytes, operator
     desk.operator.waiting.append(operator)
     desk.goal.waiting.append(goal)
     x = desk.freeze()
-    assert x.human_fault and x.human is None and x.goal is None and x.events == ()
+    assert is_faulty(x) and x.human is None and x.goal is None and x.events == ()
 
 
 def test_a_flood_of_messages_is_bounded_work(desk: Desk) -> None:

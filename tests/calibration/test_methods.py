@@ -11,8 +11,9 @@ import pytest
 from asc_rt.config import load_arm
 from calibration import hand_eye, intrinsics, montecarlo, payload, synthetic, time_offset, tool, vision
 from calibration.geometry import inverse
-from calibration.hand_eye import RobotNoise, Touch, Views
+from calibration.hand_eye import RobotNoise, Views
 from calibration.result import CalibrationError
+from calibration.touch import Touch
 from sim_hil.board_camera import Lens, render
 
 NOISE = RobotNoise()
@@ -43,13 +44,22 @@ def test_error_bars_are_honest_in_few_trials() -> None:
         xi = hand_eye.difference(found.T_base_cam, Z)
         errors.append(xi @ np.linalg.solve(found.covariance[:6, :6], xi) / 6)
     assert 0.6 < np.mean(errors) < 1.5
-    check_rows(montecarlo.other_rows(6), 0.5, 1.7)
+    check_rows(montecarlo.other_rows(4), 0.4, 1.9)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_error_bars_are_honest() -> None:
-    check_rows(iter(montecarlo.table(100)), 0.8, 1.25)
+    check_rows(montecarlo.table(100), 0.8, 1.25)
+
+
+def test_acceptance_lets_good_data_pass_and_finds_bad_ones() -> None:
+    found = montecarlo.acceptance(2)
+    assert 0.6 < found["chi2 / dof of good data, mean"] < 1.4
+    assert 0.4 < found["jack-knife sigma / true error, rms"] < 2.5
+    assert found["good data refused"] == found["good data refused by the touch check"] == 0
+    assert found["camera 10 mm off refused by the touch check"] == 1
+    assert found["robot 3 mm off in half of the views refused"] == 1
 
 
 # --- hand-eye --------------------------------------------------------------------------------------------------------
@@ -62,12 +72,20 @@ def test_a_good_hand_eye_is_accepted() -> None:
     assert np.linalg.norm(result.pose()[:3, 3] - Z[:3, 3]) < 3 * np.sqrt(np.trace(solution.covariance[:3, :3]))
 
 
+def test_what_the_lens_and_the_print_may_be_wrong_by_is_in_the_error_bar() -> None:
+    data = views(16)[0]
+    wrong = synthetic.shared_errors(np.random.default_rng(1), data)
+    alone, shared = (hand_eye.solve(v, NOISE).covariance[:3, :3] for v in (data, wrong))
+    assert np.trace(shared) > np.trace(alone) + 0.8e-6  # 0.1 % of 1.3 m, less what the views tell of it
+
+
 BAD_VIEWS = {
-    "swapped frames": (lambda v: replace(v, flange=inverse(v.flange)), "swapped frames"),
-    "camera frames swapped": (lambda v: replace(v, board=inverse(v.board)), "swapped frames"),
-    "millimetres": (lambda v: replace(v, flange=scaled(v.flange, 1000)), "wrong units"),
-    "square size": (lambda v: replace(v, board=scaled(v.board, 1.05)), "square size"),
-    "pairs out of order": (lambda v: replace(v, board=np.roll(v.board, 1, axis=0)), "contradict"),
+    "swapped frames": (lambda v: replace(v, flange=inverse(v.flange)), "fit as T_flange_base"),
+    "camera frames swapped": (lambda v: replace(v, board=inverse(v.board)), "fit as T_flange_base"),
+    "millimetres": (lambda v: replace(v, flange=scaled(v.flange, 1000)), "poses are millimetres"),
+    "square size": (lambda v: replace(v, board=scaled(v.board, 1.05)), "says 0.95"),
+    "square a little off": (lambda v: replace(v, board=scaled(v.board, 1.005)), "says 0.99"),
+    "pairs out of order": (lambda v: replace(v, board=np.roll(v.board, 1, axis=0)), "out of order"),
 }
 
 
@@ -184,11 +202,18 @@ def test_pictures_of_no_use_are_named() -> None:
         BOARD,
     )
     assert pictures.names == ["good"]
-    assert [words in line for words, line in zip(("mirrored", "blurred", "blurred"), pictures.dropped, strict=True)]
+    for words, line in zip(("mirrored", "blurred", "0 corners"), pictures.dropped, strict=True):
+        assert words in line
     with pytest.raises(CalibrationError, match="views: 1 of 4"):
         intrinsics.calibrate(pictures, BOARD)
     with pytest.raises(CalibrationError, match="one mode"):
         intrinsics.look({"a": good, "b": good[:100]}, BOARD)
+
+
+@pytest.mark.parametrize("blur", [0.6, 2.0, 5.0])
+@pytest.mark.parametrize("noise", [0.5, 6.0])
+def test_blur_is_measured_through_noise(blur: float, noise: float) -> None:
+    assert vision.edge_width(photo(blur=blur, noise=noise)) == pytest.approx(blur, abs=0.35 + 0.15 * blur)
 
 
 def centred(tilt: float, n: int = 20) -> intrinsics.Pictures:

@@ -133,7 +133,7 @@ def test_poses_and_their_differences_fit_together(numbers: list[float]) -> None:
 def test_a_cell_takes_the_hash_of_an_accepted_file_and_refuses_another(tmp_path: Path) -> None:
     path = saved(tmp_path)
     cell = load_cell("fanuc-sim", [f"human.calibration={path}"])
-    assert cell.params.human.calibration_hash == hash_number(GOOD.digest)
+    assert cell.params.human.sensors[0].calibration_hash == hash_number(GOOD.digest)
     assert read(path).digest == GOOD.digest
     saved(tmp_path, replace(GOOD, reasons=("chi2 9.1",)))
     with pytest.raises(ConfigError, match=r"human.calibration: .*accepted: it was refused: chi2 9.1"):

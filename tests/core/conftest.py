@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from asc_rt.core.fusion import heard
 from asc_rt.core.params import CapsuleSpec, HumanParams, Params, RobotParams, SafetyParams, TaskParams, ToolParams
 from asc_rt.core.step import step
 from asc_rt.core.system import System, initial
@@ -31,6 +32,7 @@ from asc_rt.core.types import (
     Mode,
     OperatorEvent,
     RobotFlag,
+    SensorReport,
     vector,
 )
 
@@ -84,7 +86,7 @@ def make_params(tool: str = "drill") -> Params:
         robot=robot,
         tool=carried,
         safety=safety,
-        human=HumanParams(age_limit_ns=200_000_000, future_limit_ns=20_000_000, calibration_hash=0),
+        human=HumanParams(100_000_000, 200_000_000, 20_000_000, 20_000_000, 0.9, 0.7),
         task=TaskParams(speed=0.5, goal_tolerance=math.radians(0.5)),
     )
 
@@ -108,7 +110,7 @@ def make_human(p0: Any, p1: Any = None, radius: Any = 0.05, v: Any = (0.0, 0.0, 
     made = HumanState(
         t_capture_ns=0,
         seq=1,
-        sensor_id=0,
+        sensor_id=1,
         calibration_hash=0,
         health=Health.OK,
         coverage=1.0,
@@ -130,8 +132,16 @@ FAR = make_human([5.0, 0.0, 0.5])
 
 
 def make_inputs(joint: JointState | None, human: HumanState | None = FAR, tick: int = 0, **changes: Any) -> CycleInputs:
-    made = CycleInputs(tick, tick * 8_000_000, 8_000_000, joint, human, 30_000_000, False, None, (), 0, False)
+    """`human` as the only sensor sent it, unless `sensors` say otherwise."""
+    age_ns = changes.get("human_age_ns", 30_000_000)
+    sensors = heard(human, age_ns)
+    made = CycleInputs(tick, tick * 8_000_000, 8_000_000, joint, human, age_ns, sensors, None, (), 0, False)
     return replace(made, **changes)
+
+
+def make_report(**changes: Any) -> SensorReport:
+    """Of a sensor of the bench that is in order."""
+    return replace(heard(FAR, 30_000_000)[0], **changes)
 
 
 def segment_distance(p0: Any, p1: Any, q0: Any, q1: Any) -> float:
@@ -272,6 +282,9 @@ class Rig:
             events=events,
             goal=goal,
         )
+        if {"human", "human_age_ns"} & changes.keys():
+            seen = changes.get("human", human)
+            changes.setdefault("sensors", heard(seen, changes.get("human_age_ns", x.human_age_ns)))
         x = replace(x, **changes)
         before = self.state
         self.state, out = step(self.system, before, x)
@@ -302,6 +315,7 @@ class _Names:
     T, HOME, GOALS, NOBODY, FAR, FINE = T, HOME, GOALS, NOBODY, FAR, FINE
     params, system = staticmethod(make_params), staticmethod(make_system)
     joint, human, inputs = staticmethod(make_joint), staticmethod(make_human), staticmethod(make_inputs)
+    report = staticmethod(make_report)
     segment_distance, true_distance = staticmethod(segment_distance), staticmethod(true_distance)
     robot_capsules = staticmethod(robot_capsules)
     skew_arm = staticmethod(skew_arm)

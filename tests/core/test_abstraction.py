@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from asc_rt.core.abstraction import People, Separation, least_distance, radii, separation
+from asc_rt.core.abstraction import People, Separation, least_distance, separation
 from asc_rt.core.kinematics import Chain
 from asc_rt.core.limits import acceleration_box
 from asc_rt.core.polytope import Polytope, greatest, support
+from asc_rt.core.radius import radii
 from asc_rt.core.robot_model import Capsules
 
 H = 2e-4  # s, of the oracle's differences

@@ -105,6 +105,7 @@ def adversary(policy: str, lower: Any, upper: Any, rng: Any, memory: dict[str, A
     return lower + (upper - lower) * share
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("policy", ["push", "bang", "random"])
 @pytest.mark.parametrize("robot", ["lrmate", "lrmate 2 ms", "sluggish", "between", "sudden"])
 def test_no_control_in_the_box_ever_breaks_a_limit(bench: Any, robot: str, policy: str) -> None:
@@ -173,3 +174,61 @@ def test_acceleration_box_is_the_full_range_in_the_open_and_shrinks_towards_a_li
     # full speed ahead leaves nothing to accelerate with; at the wall it has to brake
     assert np.all(acceleration_box(b, np.zeros(6), b.dq_max)[1] <= 1e-9)
     assert np.all(acceleration_box(b, b.q_max, 0.5 * b.dq_max)[1] < 0.0)
+
+
+def still_stops(u: float, room: float, dq: float, ddq: float, b: Bounds, T: float) -> bool:
+    """Whether joint 0 keeps its limits if its acceleration goes to u in T and it then stops as fast as it can: by
+    small steps, then the closed form that has a test of its own."""
+    A, J, most = b.ddq_max[0], b.dddq_max[0], b.dq_max[0]
+    h, way, speed, a = T / 200, 0.0, dq, ddq
+    for _ in range(200):
+        a_next = a + (u - ddq) / 200
+        way, speed, a = way + h * speed + h * h * (2 * a + a_next) / 6, speed + h * (a + a_next) / 2, a_next
+    peak = speed + max(0.0, u) ** 2 / (2 * J)
+    return bool(peak <= most and way + stopping_distance(speed, u, A, J) <= room)
+
+
+def test_the_box_ends_where_a_stop_inside_the_limits_is_just_possible() -> None:
+    rng = np.random.default_rng(11)
+    ends = {"jerk": 0, "limit": 0, "too late": 0}
+    for _ in range(150):
+        A, J, v, T = rng.uniform(3, 15), 10.0 ** rng.uniform(1, 4), rng.uniform(1, 3), rng.choice([0.002, 0.008, 0.1])
+        b = Bounds(*(np.array([x]) for x in (-9.0, 0.0, v, A, J)))
+        dq, ddq = np.array([rng.uniform(-0.2, v)]), np.array([rng.uniform(-A, A)])
+        free = T * min(A, J * T / 8.0) * (v / A + A / J)  # a stop that begins a little late
+        needed = stopping_distance(dq[0], ddq[0], A, J) + T * dq[0]
+        room = needed * rng.uniform(0.9, 1.3)
+        q = np.array([-free - room])
+        low, high = max(-A, ddq[0] - J * T), min(A, ddq[0] + J * T)
+        lower, upper = command_box(b, q, dq, ddq, T)
+        mirrored = Bounds(-b.q_max, -b.q_min, *b[2:])
+        np.testing.assert_allclose(command_box(mirrored, -q, -dq, -ddq, T)[0], -upper)
+        u = float(upper[0])
+        if not still_stops(low, room, dq[0], ddq[0], b, T):
+            assert u == low or dq[0] <= 0.0
+            ends["too late"] += 1
+            continue
+        assert still_stops(u - 1e-7, room, dq[0], ddq[0], b, T)
+        assert u == high or not still_stops(u + 1e-6, room, dq[0], ddq[0], b, T)
+        ends["jerk" if u == high else "limit"] += 1
+    assert min(ends.values()) > 10, ends
+
+
+@pytest.mark.parametrize("speed", [0.5, -0.5])
+def test_between_two_walls_the_one_that_is_approached_counts(speed: float) -> None:
+    b, T = Bounds(*(np.array([x]) for x in (-0.01, 0.01, 2.0, 8.0, 300.0))), 0.008
+    lower, upper = command_box(b, np.zeros(1), np.array([speed]), np.zeros(1), T)
+    assert lower == upper == pytest.approx(-np.sign(speed) * 300.0 * T)
+
+
+def test_acceleration_box_knows_the_speed_from_which_full_braking_just_does() -> None:
+    """At the speed sqrt(2 A room) nothing is left to accelerate with; over the speed of a jerk ramp it fades out."""
+    A, J = 8.0, 300.0
+    b = Bounds(*(np.array([x]) for x in (-0.3, 0.5, 3.0, A, J)))
+    for q in (0.1, 0.4):
+        for side, room in ((1.0, 0.5 - q), (-1.0, q + 0.3)):
+            for missing in (0.0, 0.01, 0.1, 0.3):
+                dq = side * (min(3.0, np.sqrt(2.0 * A * room)) - missing)
+                lower, upper = acceleration_box(b, np.array([q]), np.array([dq]))
+                ahead = upper[0] if side > 0 else -lower[0]
+                assert ahead == pytest.approx(min(A, missing * J / A))

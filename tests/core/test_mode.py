@@ -16,14 +16,16 @@ from asc_rt.core.types import (
     EventKind,
     Goal,
     Health,
+    MessageFault,
     Mode,
     OperatorEvent,
     RobotFlag,
+    SensorReport,
     StopReason,
     vector,
 )
 
-R, M = StopReason, Mode
+R, M, F = StopReason, Mode, MessageFault
 FAR_AWAY = float("inf")
 _ids = count(1)
 
@@ -40,7 +42,7 @@ def in_mode(bench: Any, mode: Mode, reason: StopReason = R.NONE, moving: bool | 
 
 def decide(bench: Any, state: Any, d: float = FAR_AWAY, **changes: Any) -> Any:
     params = bench.system().params
-    x = replace(bench.inputs(bench.joint(bench.HOME)), **changes)
+    x = bench.inputs(**{"joint": bench.joint(bench.HOME)} | changes)
     return next_mode(params, observe(params, state, x), x, d)
 
 
@@ -51,20 +53,28 @@ def causes(bench: Any) -> dict[StopReason, list[dict[str, Any]]]:
     bad = [{"p0": nan}, {"p1": nan}, {"v0": nan}, {"v1": nan}]
     bad += [{name: vector([np.nan])} for name in ("radius", "position_bound", "velocity_bound")]
     far = bench.FAR
+
+    def says(**changes: Any) -> tuple[SensorReport, ...]:
+        return (bench.report(**changes),)
+
     return {
         R.HUMAN_MISSING: [{"human": None, "human_age_ns": 0}],
-        R.HUMAN_STALE: [{"human_age_ns": params.human.age_limit_ns + 1}],
+        R.HUMAN_STALE: [{"human_age_ns": params.human.age_limit_ns + 1}, {"sensors": says(age_ns=200_000_001)}],
         R.HUMAN_UNHEALTHY: [
-            {"human": replace(far, health=Health.DEGRADED)},
             {"human": replace(far, health=Health.FAULT)},
             {"human": replace(bench.NOBODY, empty_certified=False)},
         ],
+        R.HUMAN_COVERAGE: [{"human": replace(far, coverage=0.69)}, {"sensors": says(coverage=np.nan)}],
+        R.HUMAN_UNSYNCED: [{"sensors": says(sigma_ns=20_000_001)}],
         R.HUMAN_INVALID: [
-            {"human_fault": True},
-            {"human_age_ns": -params.human.future_limit_ns - 1},
-            {"human": replace(far, calibration_hash=7)},
             *({"human": replace(far, **broken)} for broken in bad),
+            *({"sensors": says(fault=fault)} for fault in (F.UNREADABLE, F.ORDER, F.SENDER)),
         ],
+        R.HUMAN_SCHEMA: [{"sensors": says(fault=F.SCHEMA)}],
+        R.HUMAN_CLOCK: [{"sensors": says(fault=F.CLOCK)}, {"human_age_ns": -params.human.future_limit_ns - 1}],
+        R.HUMAN_CALIBRATION: [{"human": replace(far, calibration_hash=7)}],
+        R.TOOL_UNKNOWN: [{"joint": replace(joint, tool_id=-1)}],
+        R.TOOL_MISMATCH: [{"joint": replace(joint, tool_id=number)} for number in (1, 7, 15)],
         R.LATE: [{"missed_ticks": params.silence_cycles}],
         R.TRACKING: [
             {"joint": bench.joint(bench.HOME + 0.3)},
@@ -79,8 +89,8 @@ def causes(bench: Any) -> dict[StopReason, list[dict[str, Any]]]:
     }
 
 
-WAITING = [R.HUMAN_MISSING, R.HUMAN_STALE, R.HUMAN_UNHEALTHY, R.HUMAN_INVALID, R.LATE]
-FAULTS = [R.TRACKING, R.ROBOT_NOT_READY, R.ROBOT_FAULTED]
+WAITING = [*(r for r in R if R.HUMAN_MISSING <= r <= R.HUMAN_INVALID), R.TOOL_UNKNOWN, R.TOOL_MISMATCH, R.LATE]
+FAULTS = [R.HUMAN_SCHEMA, R.HUMAN_CLOCK, R.HUMAN_CALIBRATION, R.TRACKING, R.ROBOT_NOT_READY, R.ROBOT_FAULTED]
 
 
 def test_all_is_well_changes_nothing(bench: Any) -> None:
@@ -166,7 +176,7 @@ def test_only_arm_leads_to_active(bench: Any) -> None:
     table = [changes for reason in causes(bench).values() for changes in reason] + [{}] * 20 + [{"joint": None}]
     for _ in range(3000):
         mode = M(int(rng.integers(0, 7)))
-        state = in_mode(bench, mode, R(int(rng.integers(0, 16))), moving=bool(rng.integers(0, 2)))
+        state = in_mode(bench, mode, R(int(rng.integers(0, len(R)))), moving=bool(rng.integers(0, 2)))
         kinds = [EventKind(int(k)) for k in rng.integers(1, 4, rng.integers(0, 3))]
         events = tuple(OperatorEvent(next(_ids), kind) for kind in kinds)
         changes = table[rng.integers(len(table))]

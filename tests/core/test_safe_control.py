@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, minimize
 
-from asc_rt.core.polytope import Polytope
-from asc_rt.core.safe_control import Solution, solve
+from asc_rt.core import safe_control
+from asc_rt.core.polytope import Polytope, pack
+from asc_rt.core.safe_control import Solution, project, solve
 
 SCALE = np.array([8.7, 8.7, 12.0, 19.0, 19.0, 35.0])
 
@@ -20,7 +21,7 @@ def box(lower: Any, upper: Any) -> Polytope:
 
 def ask(u_ref: Any, C: Any, floor: Any, lower: Any, upper: Any) -> Solution:
     """Rows without a share."""
-    return solve(u_ref, C, floor, floor, box(lower, upper), SCALE)
+    return solve(u_ref, C, floor, floor, pack(box(lower, upper)), SCALE)
 
 
 def problems(count: int, seed: int = 0, rows: int = 8) -> Any:
@@ -140,11 +141,52 @@ def test_rows_with_a_share_give_way_and_the_others_do_not() -> None:
     """Two people, one on each side, both faster than the arm; and a row of the index, which holds."""
     C = np.array([[1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0]])
     floor, base = np.array([2.0, 1.0, 3.0]), np.array([-0.5, -0.5, 3.0])
-    found = solve(np.zeros(6), C, floor, base, box(-SCALE, SCALE), SCALE)
+    found = solve(np.zeros(6), C, floor, base, pack(box(-SCALE, SCALE)), SCALE)
     assert found.feasible and found.filtered
     assert 0.0 < found.share < 1.0
     assert found.share == pytest.approx(1.0 / 4.0, abs=1e-3)  # -0.5 + 2.5 s <= u <= 0.5 - 1.5 s
     assert np.all(C @ found.u >= base + found.share * (floor - base) - 1e-9)
     assert found.u[1] >= 3.0
-    stubborn = solve(np.zeros(6), C, floor, floor, box(-SCALE, SCALE), SCALE)
+    stubborn = solve(np.zeros(6), C, floor, floor, pack(box(-SCALE, SCALE)), SCALE)
     assert not stubborn.feasible
+
+
+ROW, OTHER = np.eye(6)[0], np.eye(6)[1]
+FREE = 5.0 * np.ones(6)
+
+
+@pytest.mark.parametrize(
+    ("u", "solved"),
+    [
+        (2.0 * ROW, True),  # keeps one of two rows
+        (2.0 * (ROW + OTHER) + 6.0 * np.eye(6)[4], True),  # outside the box
+        (2.0 * (ROW + OTHER) - 6.0 * np.eye(6)[4], True),
+        (2.0 * (ROW + OTHER) + 3.0 * np.eye(6)[5], True),  # above a torque limit
+        (2.0 * (ROW + OTHER) - 3.0 * np.eye(6)[5], True),
+        (2.0 * (ROW + OTHER) + np.nan * np.eye(6)[4], True),
+        (2.0 * (ROW + OTHER), False),  # says itself that it is none
+    ],
+)
+def test_the_solver_is_not_believed(u: Any, solved: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever it answers is measured at every row and limit."""
+    most = np.where(np.arange(6) == 5, 2.0, FREE)
+    torque = Polytope(-FREE, FREE, np.eye(6), -most, most)
+    C, floor = np.array([ROW, OTHER]), np.ones(2)
+    good = safe_control._Found(2.0 * (ROW + OTHER), 1.0, True, 7)
+    for answer, feasible in ((good, True), (safe_control._Found(u, 1.0, solved, 7), False)):
+        monkeypatch.setattr(safe_control, "_quadratic", lambda *_, answer=answer, **__: answer)
+        found = solve(np.zeros(6), C, floor, floor, pack(torque), SCALE)
+        assert (found.feasible, found.filtered, found.iterations) == (feasible, True, 7)
+        assert project(9.0 * ROW, pack(torque), SCALE) is (answer.u if _fits(answer, torque) else None)
+
+
+def _fits(answer: Any, U: Polytope) -> bool:
+    inside = np.all(np.abs(answer.u) <= U.upper) and abs(answer.u[5]) <= U.high[5]
+    return bool(answer.solved and inside)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_row_without_a_finite_floor_is_not_solved(wrong: float) -> None:
+    floor = np.array([-9.0, wrong])
+    found = solve(np.zeros(6), np.array([ROW, OTHER]), floor, floor, pack(box(-FREE, FREE)), SCALE)
+    assert not found.feasible and found.filtered and found.share == 0.0

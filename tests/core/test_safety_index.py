@@ -11,23 +11,33 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from asc_rt.core.abstraction import Separation
+from asc_rt.core.abstraction import nearest_first, separation
+from asc_rt.core.limits import braking, command_box
+from asc_rt.core.people import predict
+from asc_rt.core.radius import radii
 from asc_rt.core.rows import rows
 from asc_rt.core.safety_index import (
     BRAKE_SHARE,
     JERK_SHARE,
+    PHI_STAR,
+    Index,
     approach_ending,
     greatest_approach,
     phi,
     phi_rate,
     phi_star,
     psi,
+    row_floors,
 )
-from asc_rt.core.system import initial
-from asc_rt.core.types import Basis, Mode, vector
+from asc_rt.core.system import System, initial
+from asc_rt.core.types import Basis, Mode, Outside, vector
 
 T = 0.008
-D_MIN, ETA, M_FLOOR = 0.1, 1.0, 0.3
+D_MIN, ETA, M_FLOOR, V_MAX = 0.1, 1.0, 0.3, 2.0
+
+
+def index(k: float) -> Index:
+    return Index(PHI_STAR, D_MIN, k, 1.0, ETA, M_FLOOR, V_MAX)
 
 
 def numbers(low: float, high: float) -> Any:
@@ -71,7 +81,7 @@ def test_psi_is_the_largest_phi_of_the_hardest_brake() -> None:
             rng.uniform(0.3, 8.0),
         )
         expected = brake_by_steps(d, v, a, M, M_dot, J, k)
-        assert psi(d, v, a, M, M_dot, J, D_MIN, k, M_FLOOR) == pytest.approx(expected, rel=1e-3, abs=1e-3)
+        assert psi(d, v, a, M, M_dot, J, index(k)) == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
 @settings(max_examples=500, deadline=None)
@@ -79,7 +89,7 @@ def test_psi_is_the_largest_phi_of_the_hardest_brake() -> None:
 def test_psi_rises_with_acceleration_speed_and_nearness(state: Any, system: Any, more: float) -> None:
     d, v, a = state
     M, M_dot, J, k = system
-    rest = (M, M_dot, J, D_MIN, k, M_FLOOR)
+    rest = (M, M_dot, J, index(k))
     here = psi(d, v, a, *rest)
     slack = 1e-4 * (1.0 + abs(here))
     assert psi(d, v, a + more, *rest) >= here - slack
@@ -90,13 +100,13 @@ def test_psi_rises_with_acceleration_speed_and_nearness(state: Any, system: Any,
 
 def test_psi_at_rest_and_in_retreat_is_phi() -> None:
     for v, a in ((0.0, 0.0), (-0.5, -1.0), (-0.5, 0.0)):
-        assert psi(0.3, v, a, 5.0, 0.0, 50.0, D_MIN, 3.0, M_FLOOR) == phi(0.3, v, 5.0, D_MIN, 3.0)
+        assert psi(0.3, v, a, 5.0, 0.0, 50.0, index(3.0)) == phi(0.3, v, 5.0, index(3.0))
 
 
 def test_phi_by_hand() -> None:
     assert phi_star(0.3, 0.5, 4.0, 0.1, 3.0) == pytest.approx(0.01 - 0.09 + 3.0 * 0.5 / 4.0)
-    assert phi(0.05, -1.0, 4.0, 0.1, 3.0) == pytest.approx(0.05)  # phi0: too near, however fast it retreats
-    assert phi(-0.2, 0.0, 4.0, 0.1, 3.0) == pytest.approx(0.3)
+    assert phi(0.05, -1.0, 4.0, index(3.0)) == pytest.approx(0.05)  # phi0: too near, however fast it retreats
+    assert phi(-0.2, 0.0, 4.0, index(3.0)) == pytest.approx(0.3)
     assert phi_star(-0.2, 0.0, 4.0, 0.1, 3.0) == pytest.approx(0.05)  # overlap is worse than contact
 
 
@@ -116,19 +126,20 @@ def test_approach_ending_in_closed_form(v: float, a: float, J: float) -> None:
 def test_greatest_approach_is_the_edge_of_what_keeps_the_row(state: Any, system: Any) -> None:
     d, v, a = state
     M, M_dot, J, k = system
-    u = greatest_approach(d, v, a, T, M, M_dot, J, D_MIN, k, ETA, M_FLOOR, M + abs(a) + 100.0)
+    most = M + abs(a) + 100.0
+    u = min(most, greatest_approach(d, v, a, T, M, M_dot, J, index(k), most))
 
     def after(control: float) -> float:
         d_after = d - T * v - T * T * (2.0 * a + control) / 6.0
-        return psi(d_after, v + T * (a + control) / 2.0, control, M + T * min(0.0, M_dot), M_dot, J, D_MIN, k, M_FLOOR)
+        return psi(d_after, v + T * (a + control) / 2.0, control, M + T * min(0.0, M_dot), M_dot, J, index(k))
 
-    target = max(0.0, psi(d, v, a, M, M_dot, J, D_MIN, k, M_FLOOR) * (1.0 - ETA * T))
+    target = max(0.0, psi(d, v, a, M, M_dot, J, index(k)) * (1.0 - ETA * T))
     slack = 1e-4 * (1.0 + target)
     if u <= -4.0 * M - abs(a) - 10.0 + 1e-6:
         assert after(u) > target - slack  # nothing keeps the row: it asks for all there is
     else:
         assert after(u) <= target + slack
-        if u < M + abs(a) + 100.0 - 1e-6:
+        if u < most - 1e-6:
             assert after(u + 1.0) > target - slack
 
 
@@ -151,8 +162,8 @@ def test_the_row_is_persistently_feasible_on_the_abstract_system(M: float, J: fl
     d, v_r, v_h, a = 0.9, 0.0, 0.0, 0.0
     for _ in range(1200):
         v = v_r + v_h
-        assert psi(d, v, a + bound, M, 0.0, counted, D_MIN, k, M_FLOOR) <= 1e-6
-        allowed = greatest_approach(d, v, a + bound, T, M, 0.0, counted, D_MIN, k, ETA, M_FLOOR, M + 200.0) - bound
+        assert psi(d, v, a + bound, M, 0.0, counted, index(k)) <= 1e-6
+        allowed = greatest_approach(d, v, a + bound, T, M, 0.0, counted, index(k), M + 200.0) - bound
         assert allowed >= max(a - J * T, -M - bound)  # the arm can do it
         wanted = min(a + J * T, 8.0) if v_r + a * abs(a) / (2.0 * J) < 1.5 else max(a - J * T, -M)
         u = min(wanted, allowed)
@@ -168,12 +179,10 @@ def test_phi_rate_is_the_derivative_of_phi() -> None:
     seen = set()
     for _ in range(300):
         d, v, a, M, M_dot = rng.uniform([-0.1, -1.0, -5.0, 1.0, -10.0], [0.6, 1.0, 5.0, 10.0, 10.0])
-        one = np.array([0.0])
-        pairs = Separation(one, one, np.array([d]), np.array([-v]), np.zeros((1, 2)), np.array([-a - 1.0]), one, one)
-        rate = phi_rate(pairs, np.array([M]), np.array([M_dot]), np.array([1.0]), D_MIN, 3.0)[0]
+        rate = phi_rate(d, -v, -a, M, M_dot, index(3.0))
         h = 1e-6
         now, ahead, behind = (
-            phi(d - v * t - a * t * t / 2.0, v + a * t, M + M_dot * t, D_MIN, 3.0) for t in (0.0, h, -h)
+            phi(d - v * t - a * t * t / 2.0, v + a * t, M + M_dot * t, index(3.0)) for t in (0.0, h, -h)
         )
         if abs((ahead - now) - (now - behind)) > 1e-8:
             continue  # phi0 and phi* cross here
@@ -210,12 +219,84 @@ def test_no_single_row_asks_for_more_than_the_joint_bounds_give(bench: Any) -> N
     seen = set()
     for state, x in scenes(bench, 150, 3):
         found = rows(system, state, x)
-        most = np.maximum(found.C * found.U.lower, found.C * found.U.upper).sum(axis=1)
+        most = np.maximum(found.C * found.box[0], found.C * found.box[1]).sum(axis=1)
         assert np.all(np.isfinite(found.floor))
         assert np.all(found.floor < most)
         assert np.all(found.base <= found.floor)
         seen |= set(found.basis.tolist())
     assert seen == set(Basis)
+
+
+def evaluated(system: Any, state: Any, x: Any) -> tuple[Any, tuple[Any, ...]]:
+    """(pairs, row_floors) of a scene with M of every pair, those that `rows` leaves out as well."""
+    s, b = system.params.safety, system.bounds
+    people = predict(x.human, (x.human_age_ns + system.params.robot.command_latency_ns) * 1e-9)
+    q, dq, ddq = state.q_cmd, state.dq_cmd, state.ddq_cmd
+    a_h = s.human_acceleration
+    chain, capsules = system.model.chain, system.model.capsules
+    pairs = nearest_first(separation(chain, capsules, people, q, dq, s.activation_distance, a_h))
+    M, M_dot = radii(system.model.arm, people, q, dq, ddq, a_h, pairs)
+    box = command_box(b, q, dq, ddq, T)
+    brake_time = float(np.max(np.abs(dq) / b.ddq_max + b.ddq_max / b.dddq_max))
+    none = np.zeros(len(M), np.bool_)
+    return pairs, row_floors(
+        pairs, none, M, M_dot, ddq, b.dddq_max, *box, braking(b, dq, *box), T, system.index, brake_time
+    )
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.15])
+def test_a_row_that_is_left_out_is_one_that_no_control_can_break(bench: Any, speed: float) -> None:
+    """With its real M and M_dot it asks for no more than the least that the joint bounds leave; the others are as they
+    are with all pairs evaluated."""
+    system, free = bench.system(), 0
+    for state, x in scenes(bench, 100, 8, speed):
+        found = rows(system, state, x)
+        left_out = found.basis == Basis.FREE
+        pairs, (value, floor, base, basis, outside) = evaluated(system, state, x)
+        np.testing.assert_array_equal(pairs.d, found.pairs.d)
+        least = np.minimum(found.C * found.box[0], found.C * found.box[1]).sum(axis=1)
+        assert np.all(floor[left_out] <= least[left_out] + 1e-6)
+        assert np.all(found.M[left_out] == 0.0)
+        assert np.all((found.phi >= value) | (found.pairs.d_dot > 0.0))
+        quick = found.floor, found.base, found.basis, found.which[3]
+        for mine, full in zip(quick, (floor, base, basis, outside), strict=True):
+            np.testing.assert_array_equal(mine[~left_out], full[~left_out])
+        free += left_out.sum()
+    assert free > 50
+
+
+def test_outside_its_ranges_a_pair_is_flagged_and_near_the_approach_has_to_end(bench: Any) -> None:
+    """The same scenes with a certificate for hardly any speed: rows only ask for more, and near they are those of a
+    robot that does not approach, or all that the arm can do."""
+    system = bench.system()
+    slow = System(replace(system.params, safety=replace(system.params.safety, v_max=0.2)))
+    seen, stricter = Outside.NOTHING, 0
+    for state, x in scenes(bench, 100, 9):
+        found, strict = rows(system, state, x), rows(slow, state, x)
+        d, v = strict.pairs.d, -strict.pairs.d_dot
+        for i, flags in enumerate(strict.which[3]):
+            assert bool(flags & Outside.SPEED) == (v[i] > 0.2)
+            assert bool(flags & Outside.DISTANCE) == (d[i] < system.params.safety.d_min)
+            assert bool(flags & Outside.RADIUS) == (strict.basis[i] == Basis.M_FLOOR)
+            seen |= Outside(int(flags))
+        assert np.all(strict.floor >= found.floor)
+        changed = strict.floor > found.floor
+        assert np.all(np.isin(strict.basis[changed], (Basis.STANDSTILL, Basis.RAMP)))
+        stricter += changed.sum()
+    assert seen == Outside.DISTANCE | Outside.SPEED | Outside.RADIUS
+    assert stricter > 5
+
+
+def test_the_joint_space_brake_keeps_the_rows_of_what_the_control_hardly_reaches(bench: Any) -> None:
+    """Whatever carries such a link to and fro: its row never asks to be driven on."""
+    system, seen = bench.system(), 0
+    for state, x in scenes(bench, 150, 10, speed=3.0):
+        found = rows(system, state, x)
+        brake = braking(system.bounds, state.dq_cmd, *found.box)
+        slow = found.basis == Basis.M_FLOOR
+        assert np.all(found.C[slow] @ brake >= found.floor[slow])
+        seen += np.sum(found.floor[slow] > -1e5)
+    assert seen > 50
 
 
 def test_at_rest_standing_still_keeps_every_row_strictly(bench: Any) -> None:
@@ -277,7 +358,7 @@ def test_retreat_is_not_slowed(bench: Any) -> None:
         arm_state(system, bench.HOME, np.zeros(6), np.zeros(6)),
         bench.inputs(bench.joint(bench.HOME), bench.human([[0.6, 0.35, 0.3]])),
     )
-    away = np.where(found.C[0] > 0.0, found.U.upper, found.U.lower)
+    away = np.where(found.C[0] > 0.0, found.box[1], found.box[0])
     kept = found.C @ away >= found.floor
     assert kept[0]
 

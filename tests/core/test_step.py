@@ -103,7 +103,7 @@ def moving_rig(bench: Any, people: Any = None, cycles: int = 60) -> Any:
 FAILURES = {
     "human gone": ({"human": None, "human_age_ns": 0}, StopReason.HUMAN_MISSING, Mode.STOPPED),
     "human stale": ({"human_age_ns": 201_000_000}, StopReason.HUMAN_STALE, Mode.STOPPED),
-    "human garbled": ({"human_fault": True}, StopReason.HUMAN_INVALID, Mode.STOPPED),
+    "sensor gone": ({"sensors": ()}, StopReason.HUMAN_MISSING, Mode.STOPPED),
     "samples lost": ({"missed_ticks": 12}, StopReason.LATE, Mode.STOPPED),
     "operator": ({"events": (OperatorEvent(99, EventKind.STOP),)}, StopReason.OPERATOR_STOP, Mode.STOPPED),
     "end": ({"events": (OperatorEvent(99, EventKind.END),)}, StopReason.SESSION_END, Mode.ENDED),
@@ -149,6 +149,21 @@ def test_stale_data_stop_the_robot_within_the_age_limit_plus_its_stopping_time(b
         assert rig.state.mode is (Mode.ACTIVE if fresh else Mode.STOPPING)
     assert rig.state.mode is Mode.STOPPED
     assert k * T <= 0.2 + 1.0
+
+
+def test_an_enforced_protective_distance_stops_a_robot_that_the_rows_let_go_on(bench: Any) -> None:
+    """A person who stands still, out of the way: no row asks for a stop, S_p of a fast arm is longer."""
+    person = bench.human([[1.15, 0.0, 0.3]])
+    for is_enforced in (False, True):
+        params = bench.system().params
+        monitor = replace(params.monitor, is_enforced=is_enforced)
+        system = System(replace(params, monitor=monitor))
+        rig = bench.Rig(system, lambda t: person)
+        rig.run(0.5)
+        assert rig.state.mode is Mode.ACTIVE and rig.state.reason is StopReason.NONE
+        fast = replace(rig.cycles[-1].x.joint, dq=vector([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        assert rig.cycle(joint=fast).out.decision.reason is (StopReason.SEPARATION if is_enforced else StopReason.NONE)
+        assert rig.state.mode is (Mode.STOPPING if is_enforced else Mode.ACTIVE)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +221,9 @@ def test_rows_in_conflict_brake_the_robot(bench: Any, monkeypatch: pytest.Monkey
 
     def impossible(*args: Any) -> Any:
         found = real(*args)
-        return replace(found, floor=np.full_like(found.floor, 1e3), base=np.full_like(found.base, 1e3))
+        values = found.values.copy()
+        values[3:5] = 1e3  # floor and base
+        return found._replace(values=values)
 
     rig.people = lambda t: bench.human([[0.9, 0.0, 0.3]])
     monkeypatch.setattr(module, "rows", impossible)
@@ -251,7 +268,9 @@ def test_without_the_rows_the_same_scenes_would_end_in_violations(bench: Any, mo
 
     def none(*args: Any) -> Any:
         found = real(*args)
-        return replace(found, floor=np.full_like(found.floor, -1e6), base=np.full_like(found.base, -1e6))
+        values = found.values.copy()
+        values[3:5] = -1e6  # floor and base
+        return found._replace(values=values)
 
     monkeypatch.setattr(module, "rows", none)
     system = bench.system()
@@ -394,3 +413,20 @@ def test_a_defect_brakes_on_the_stop_profile_and_ends_the_session(bench: Any, mo
         assert out.command is not None and out.stop is None
     assert state.mode is Mode.FAULT and out is not None and out.stop is not None
     assert tick > 5 and np.all(np.abs(state.dq_cmd) < 1e-9) and np.all(np.abs(state.q_cmd) < 0.2)
+
+
+def test_a_goal_inside_a_person_is_told_with_the_distance_and_never_reached(bench: Any) -> None:
+    """The arm stands as near as it may; `d_goal` says what is missing, and the goal is reached when the person goes."""
+    system = bench.system()
+    goal = bench.GOALS[1]
+    way = [place for _, *ends, _ in bench.robot_capsules(system, goal)[-1:] for place in ends]
+    there = bench.human(way[0], way[1], 0.05)
+    rig = bench.Rig(system, lambda t: there if t < 4.0 else bench.FAR, bench.GOALS[0])
+    cycles = rig.run(4.0, [goal])
+    missing = cycles[-1].out.decision.d_goal
+    assert missing == pytest.approx(bench.true_distance(system, goal, there), abs=2e-6)  # less is touching
+    assert missing < system.params.safety.d_min
+    assert cycles[-1].state.reached_id == 0 and cycles[-1].state.mode is Mode.ACTIVE
+    assert min(bench.true_distance(system, c.q_true, there) for c in cycles) >= system.params.safety.d_min - 1e-4
+    assert rig.run(4.0, [goal])[-1].state.reached_id > 0
+    assert rig.cycles[-1].out.decision.d_goal > system.params.safety.d_min

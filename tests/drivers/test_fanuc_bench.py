@@ -11,6 +11,7 @@ import pytest
 from drivers.fanuc_stream_motion import bench
 from sim_hil.fanuc.arm import KinematicPlant
 from sim_hil.fanuc.controller import Controller
+from sim_hil.fanuc.faults import FaultyController
 from sim_hil.fanuc.server import serve
 
 
@@ -28,7 +29,7 @@ def test_a_session_is_timed_from_the_kernels_stamp(tmp_path: Path, monkeypatch: 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
         robot.bind(("127.0.0.1", 0))
         robot.setblocking(False)
-        thread = threading.Thread(target=serve, args=(robot, controller, [], (None, None), stop))
+        thread = threading.Thread(target=serve, args=(robot, FaultyController(controller), (lambda: None, None), stop))
         thread.start()
         try:
             rows = bench.bench_session("127.0.0.1", robot.getsockname()[1], 3, bench.WARM_UP + 20)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from asc_rt.config import load_cell
+from asc_rt.core.fusion import heard
 from asc_rt.core.step import step
 from asc_rt.core.system import System, initial
 from asc_rt.core.types import (
@@ -96,7 +97,9 @@ class Cell:
         events = (OperatorEvent(tick + 1, kind),) if tick and (tick % 60 == 5 or kind is not EventKind.ARM) else ()
         joint = self.driver.read(self.link.now_ns() + 3 * p.period_ns)
         now = self.link.now_ns()
-        return CycleInputs(tick, now, p.period_ns, joint, person(now), 0, False, self.goal, events, 0, False)
+        return CycleInputs(
+            tick, now, p.period_ns, joint, (seen := person(now)), 0, heard(seen, 0), self.goal, events, 0, False
+        )
 
 
 def person(now_ns: int) -> HumanState:
@@ -162,7 +165,7 @@ def goals_a_minute(name: str, flange_speed: float, goals: int = 24) -> tuple[flo
             events = (OperatorEvent(tick + 1, EventKind.ARM),)
             now = cell.link.now_ns()
             nobody = dataclasses.replace(person(now), p0=FAR, p1=FAR)
-            x = CycleInputs(tick, now, 8_000_000, joint, nobody, 0, False, goal, events, 0, False)
+            x = CycleInputs(tick, now, 8_000_000, joint, nobody, 0, heard(nobody, 0), goal, events, 0, False)
             cell.state, out = step(cell.system, cell.state, x)
             assert out.command is not None
             cell.driver.write(out.command)

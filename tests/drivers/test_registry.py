@@ -14,7 +14,9 @@ def test_a_name_gives_its_class() -> None:
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"unknown driver 'fanuc'; known: fanuc-j519, fanuc-stream-motion-b, loopback"):
+    with pytest.raises(
+        ValueError, match=r"unknown driver 'fanuc'; known: can, fanuc-j519, fanuc-stream-motion-b, loopback"
+    ):
         registry.driver_class("fanuc")
 
 

@@ -26,6 +26,7 @@ from sim_hil.fanuc.arm import KinematicPlant
 from sim_hil.fanuc.cabinet import Cabinet
 from sim_hil.fanuc.controller import Controller
 from sim_hil.fanuc.controller_b import ControllerB
+from sim_hil.fanuc.faults import FaultyController
 from sim_hil.fanuc.rmi_sockets import RmiSockets
 from sim_hil.fanuc.server import serve
 from sim_hil.fanuc.settings import Settings
@@ -46,23 +47,27 @@ def way(seconds: float = 1.6, angle: float = TURN) -> list[float]:
 
 
 @contextmanager
-def robot(ros: bool = False, **settings: Any) -> Iterator[tuple[Cabinet, tuple[str, int], int]]:
+def robot(ros: bool = False, home: Any = HOME, **settings: Any) -> Iterator[tuple[Cabinet, tuple[str, int], int]]:
     """A simulated robot on UDP; (it, where, RMI port)."""
-    plant = KinematicPlant(np.radians(HOME), T)
+    plant = KinematicPlant(np.radians(home), T)
     controller: Cabinet
-    poll, rmi_port, sockets = None, 0, None
+    rmi_port, sockets = 0, None
+
+    def poll() -> None:
+        if sockets is not None:
+            sockets.poll()
+
     if ros:
         controller = ros_controller = ControllerB(plant, Settings(arm="crx_10ia_l", limits=True, **settings))
         rmi_port = free_pair()
         sockets = RmiSockets(ros_controller, "127.0.0.1", rmi_port)
-        poll = sockets.poll
     else:
         controller = Controller(plant, Settings(limits=True, **{"capacity": 10, "start_move": 9, **settings}))
     stop: list[int] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", 0))
         link.setblocking(False)
-        thread = threading.Thread(target=serve, args=(link, controller, [], (poll, None), stop))
+        thread = threading.Thread(target=serve, args=(link, FaultyController(controller), (poll, None), stop))
         thread.start()
         try:
             yield controller, link.getsockname(), rmi_port
@@ -221,6 +226,17 @@ def test_a_pose_out_of_reach_is_an_alarm() -> None:
         while pc.hear(w.Status).status & 1:
             pass
         assert controller.alarms[0].number == "MOTN-018"
+
+
+@pytest.mark.parametrize("until", [-1.0, 3.0])
+def test_poses_that_turn_the_wrist_over_are_an_alarm(until: float) -> None:
+    """J5 from -3 deg on: beyond 0 the same line needs the other configuration of the wrist."""
+    with robot(home=(0.0, 10.0, 10.0, 0.0, -3.0, 0.0)) as (controller, where, _), Client(where, 3) as pc:
+        pc.say(w.Head(0, 3))
+        q = controller._plant.q.copy()
+        turned = [np.append(q[:4], [np.radians(-3.0 + a), q[5]]) for a in way(0.6, 3.0 + until)]
+        pc.follow([list(controller.arm.pose(q)[:6]) for q in turned], style=0)
+        assert [alarm.number for alarm in controller.alarms][:1] == ([] if until < 0 else ["MOTN-156"])
 
 
 def test_joints_and_poses_in_one_session_are_an_alarm() -> None:

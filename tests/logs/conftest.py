@@ -15,6 +15,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from asc_rt.config import Cell, load_cell
+from asc_rt.core.fusion import heard
 from asc_rt.core.params import Params
 from asc_rt.core.step import step
 from asc_rt.core.system import System, initial
@@ -60,7 +61,7 @@ def decide(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
     column, index = vector([d, d + 1.0]), np.arange(2)
     pairs = Pairs(
         robot=index, human=index, basis=index, d=column, d_dot=column, M=column, M_dot=column, phi=column,
-        phi_dot=column, floor=column, achieved=column,
+        phi_dot=column, floor=column, achieved=column, outside=0 * index,
     )  # fmt: skip
     armed = any(event.kind is EventKind.ARM for event in x.events)
     mode = Mode.ACTIVE if armed else state.mode
@@ -68,7 +69,7 @@ def decide(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
     reason = StopReason.SESSION_END if last else StopReason.NONE
     decision = SafetyDecision(
         status=Status.PASS, reason=reason, u_ref=vector(np.sin(x.joint.q)) if x.joint else vector(q), u_safe=vector(q),
-        pairs=pairs, pair_count=2, iterations=x.missed_ticks, share=1.0, d_measured=d,
+        pairs=pairs, pair_count=2, iterations=x.missed_ticks, share=1.0, d_measured=d, d_goal=d, monitor=None,
     )  # fmt: skip
     command = JointCommand(x.tick, CommandKind.POSITION, vector(q), vector(q), vector(0 * q), last)
     after = dataclasses.replace(
@@ -91,16 +92,15 @@ def inputs(tick: int, n: int) -> CycleInputs:
         visibility=np.zeros(m, np.int64),
     )  # fmt: skip
     events = (OperatorEvent(1, EventKind.ARM),) if tick == 2 else ()
-    return CycleInputs(
-        tick, t_ns, PERIOD_NS, joint, human if tick > 1 else None, 30_000_000, False, None, events, 0, False
-    )
+    seen = human if tick > 1 else None
+    return CycleInputs(tick, t_ns, PERIOD_NS, joint, seen, 30_000_000, heard(seen, 30_000_000), None, events, 0, False)
 
 
 def run_session(n: int, count: int, end: bool = True) -> list[Cycle]:
     zero = vector(np.zeros(n))
     state = CoreState(
-        tick=0, mode=Mode.HOLD, reason=StopReason.NONE, q_cmd=zero, dq_cmd=zero, ddq_cmd=zero,
-        goal=Goal(1, vector(np.ones(n))), reached_id=0, event_id=0, silent_cycles=0, ending=False,
+        tick=0, mode=Mode.HOLD, reason=StopReason.NONE, slow=StopReason.NONE, tool=0, q_cmd=zero, dq_cmd=zero,
+        ddq_cmd=zero, goal=Goal(1, vector(np.ones(n))), reached_id=0, event_id=0, silent_cycles=0, ending=False,
     )  # fmt: skip
     cycles: list[Cycle] = []
     for tick in range(count):
@@ -147,8 +147,7 @@ class Recording:
         out = []
         for cycle in cycles:
             self.layout.pack(buffer, *cycle)
-            self.layout.seal(buffer)
-            out.append(bytes(buffer))
+            out.append(self.layout.sealed(buffer))
         return out
 
     def write(
@@ -222,9 +221,9 @@ def core_session(recording: Recording) -> tuple[Path, list[Any]]:
             plain.joint, q=state.q_cmd if k else q, dq=state.dq_cmd, flags=RobotFlag.READY | RobotFlag.SERVO_ON
         )
         events = (OperatorEvent(1, EventKind.ARM),) if k == 3 else ()
-        x = dataclasses.replace(
-            plain, joint=joint, human=approaching(plain.t_ns, k + 1), goal=goal, events=events, late=False
-        )
+        human = approaching(plain.t_ns, k + 1)
+        sensors = heard(human, plain.human_age_ns)
+        x = dataclasses.replace(plain, joint=joint, human=human, sensors=sensors, goal=goal, events=events, late=False)
         before = state
         state, out = step(system, before, x)
         assert out.command is not None
@@ -263,7 +262,7 @@ def wire_session(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
             assert told is not None
             joint = dataclasses.replace(x.joint, seq=told[0], q=told[1], current=told[2])
             packets.append((schema.WIRE_RX, joint.t_rx_ns, data))
-            sent = codec().encode_set_point(receipt.seq, out.command.q, out.command.is_last)
+            sent = codec().encode_command(receipt.seq, out.command)
             packets.append((schema.WIRE_TX, receipt.t_tx_ns, sent))
             cycles.append((state, dataclasses.replace(x, joint=joint), out, receipt, timings))
         spoil(packets)

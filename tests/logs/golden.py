@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from asc_rt.config import load_cell
+from asc_rt.core.fusion import heard
 from asc_rt.core.params import Params
 from asc_rt.core.step import step
 from asc_rt.core.system import System, initial
@@ -70,8 +71,7 @@ def make(path: Path) -> None:
     buffer = layout.buffer()
     for cycle in play(params):
         layout.pack(buffer, *cycle)
-        layout.seal(buffer)
-        records.append(bytes(buffer))
+        records.append(layout.sealed(buffer))
     path.parent.mkdir(exist_ok=True)
     path.unlink(missing_ok=True)
     files = {**attachments(cell), schema.PARAMS: params.canonical()}
@@ -100,7 +100,7 @@ def play(params: Params) -> list[tuple[object, ...]]:
         )  # fmt: skip
         events = (OperatorEvent(k, EVENTS[k]),) if k in EVENTS else ()
         age = t_ns - seen.t_capture_ns
-        x = CycleInputs(k, t_ns, params.period_ns, joint, seen, age, False, goal, events, 0, False)
+        x = CycleInputs(k, t_ns, params.period_ns, joint, seen, age, heard(seen, age), goal, events, 0, False)
         before = state
         state, out = step(system, before, x)
         sent = None if out.command is None else WriteReceipt(t_ns + 1_000_000, k, out.command.q, True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from asc_rt.core.types import CommandKind, Mode, StopReason, vector
+from asc_rt.core.types import CommandKind, JointCommand, Mode, StopReason, vector
 from drivers.registry import driver_class
 from logs import audit_rules as rules
 from logs import audit_wire, schema, seal
@@ -34,14 +34,14 @@ def session(core_session: tuple[Path, list[Any]]) -> Path:
 
 @pytest.fixture
 def evidence(session: Path) -> Evidence:
-    return gather(open_recording(session))
+    return gather(session)
 
 
 def test_a_good_session_keeps_every_rule(session: Path) -> None:
     report, _ = audit(session, KEY.public_key(), "KEY", sample=40)
     assert [rule["name"] for rule in report["rules"] if not rule["holds"]] == []
     assert report["holds"]
-    assert set(report["not_judged"]) == {"joint torque", "sent bytes"}
+    assert set(report["not_judged"]) == {"joint torque", "sent bytes", "tool"}
     keys = {"rules", "sealed", "crc_ok", "complete", "cycles", "gaps", "min_distance_m", "worst_phi", "stops"}
     assert keys | {"certificate"} <= set(report)
     assert (report["cycles"], report["crc_ok"], report["complete"], report["gaps"]) == (150, True, True, [])
@@ -117,11 +117,11 @@ def backwards(e: Evidence) -> None:
 
 
 def old_person(e: Evidence) -> None:
-    e.c["inputs.human_age_ns"][active(e)] = e.log.params.human.age_limit_ns + 1
+    e.c["inputs.sensors.age_ns"][active(e), 0] = e.log.params.human.age_limit_ns + 1
 
 
 def future_person(e: Evidence) -> None:
-    e.c["inputs.human_age_ns"][active(e)] = -e.log.params.human.future_limit_ns - 1
+    e.c["inputs.sensors.age_ns"][active(e), 0] = -e.log.params.human.future_limit_ns - 1
 
 
 def no_person(e: Evidence) -> None:
@@ -129,7 +129,19 @@ def no_person(e: Evidence) -> None:
 
 
 def sick_person(e: Evidence) -> None:
-    e.c["inputs.human.health"][active(e)] = 2
+    e.c["inputs.sensors.health"][active(e), 0] = 2
+
+
+def refused_message(e: Evidence) -> None:
+    e.c["inputs.sensors.fault"][active(e), 0] = 2
+
+
+def covered_camera(e: Evidence) -> None:
+    e.c["inputs.sensors.coverage"][active(e), 0] = 0.1
+
+
+def other_camera(e: Evidence) -> None:
+    e.c["inputs.sensors.id"][active(e), 0] = 2
 
 
 def beyond(path: str, limit: str, joint: int = 2, factor: float = 1.01) -> Callable[[Evidence], None]:
@@ -180,6 +192,10 @@ def endless_stop(e: Evidence) -> None:
     e.c["state.reason"][20:] = StopReason.HUMAN_STALE
 
 
+def sent_late(e: Evidence) -> None:
+    e.c["receipt.t_tx_ns"][active(e)] += 300_000_000
+
+
 def stop_without_cause(e: Evidence) -> None:
     i = active(e)
     e.c["state.mode"][i : i + 2] = Mode.STOPPING
@@ -212,9 +228,11 @@ def other_packets(e: Evidence) -> None:
         (rules.signature, other_file), (rules.closed, not_closed), (rules.records, altered),
         (rules.completeness, gap), (rules.completeness, twice), (rules.timing, pause), (rules.timing, backwards),
         (rules.human_age, old_person), (rules.human_age, future_person), (rules.human_age, no_person),
-        (rules.human_age, sick_person), (rules.position, too_far), (rules.speed, beyond("state.dq_cmd", "dq_max")),
+        (rules.human_age, sick_person), (rules.human_age, refused_message), (rules.human_age, covered_camera),
+        (rules.human_age, other_camera), (rules.position, too_far), (rules.speed, beyond("state.dq_cmd", "dq_max")),
         (rules.speed, not_a_number), (rules.acceleration, beyond("state.ddq_cmd", "ddq_max")), (rules.jerk, jump),
         (rules.separation, near), (rules.safety_rows, broken_row), (rules.stop_times, endless_stop),
+        (rules.reaction, sent_late),
         (rules.stop_times, stop_without_cause), (rules.no_motion, creeps), (rules.armed, armed_by_nobody),
         (rules.replayed, decided_otherwise), (rules.wire, other_packets),
     ],
@@ -272,7 +290,7 @@ def test_sent_bytes_are_decoded_independently(wire_session: Callable[..., Path],
             changed[byte if byte > 0 else 33] ^= 0x40
             packets[7] = (channel, t_ns, bytes(changed))
 
-    found = rules.wire_bytes(gather(open_recording(wire_session(spoil))))
+    found = rules.wire_bytes(gather(wire_session(spoil)))
     assert found.holds == (byte is None)
     assert not found.skipped
 
@@ -291,7 +309,7 @@ def test_each_decoder_agrees_with_the_codec_it_shares_nothing_with(
 ) -> None:
     codec: Any = driver_class(driver)({"host": "127.0.0.1", **options})
     q = vector(np.linspace(-1.2, 1.3, 6))
-    data = codec.encode_set_point(4711, q, True)
+    data = codec.encode_command(4711, JointCommand(0, CommandKind.POSITION, q, q, q, True))
     told = audit_wire.DECODERS[driver](data)
     assert told is not None and (told.seq, told.last) == (4711, True)
     np.testing.assert_allclose(told.q, q, atol=audit_wire.ROUNDING)
@@ -383,7 +401,7 @@ def test_the_page_needs_nothing_else_and_shows_the_near_miss_first(session: Path
     assert "data:image/png;base64," in page
     assert "http" not in page.replace("http://www.w3.org", "")
     plots = [part.split("</svg>")[0] for part in page.split("<svg")[1:]]
-    assert len(plots) == 6
+    assert len(plots) == 7  # the last is of the latencies
     for plot in plots:
         ET.fromstring(f"<svg{plot}</svg>")
         assert "nan" not in plot and "inf" not in plot.replace("info", "")

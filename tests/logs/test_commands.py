@@ -1,6 +1,8 @@
 """`asc recover` and `asc audit` as a script uses them: exit codes, one JSON object, one line for bad input."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,8 @@ from typer.testing import CliRunner
 from asc_rt import cli
 from logs import seal
 from logs.reader import open_log
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -82,3 +86,18 @@ def test_a_what_if_is_told_in_words_and_as_json(run: Any, core_session: tuple[Pa
     found = last_json(out)
     assert {"cycles", "mismatches", "exact", "first_difference", "fields", "stops", "waveforms"} <= set(found)
     assert last_json(run("replay", str(core_session[0]), "--diff", "--json")[1])["exact"] is True
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("command", [["replay"], ["replay", "-j", "2"], ["audit", "--replay", "5"]])
+def test_replay_and_audit_run_as_a_user_runs_them(
+    core_session: tuple[Path, list[Any]], tmp_path: Path, command: list[str]
+) -> None:
+    """In a process of their own: BLAS must be limited before anything that the command line imports loads numpy."""
+    name, *options = command
+    words = [sys.executable, "-m", "asc_rt", name, str(core_session[0]), *options, "--json"]
+    environment = {"PATH": "/usr/bin", "HOME": str(tmp_path)}
+    done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=280)
+    assert done.returncode == 0, done.stderr
+    found = last_json(done.stdout)
+    assert found["holds"] if name == "audit" else (found["exact"], found["mismatches"]) == (True, 0)

@@ -200,6 +200,11 @@ def test_a_rotated_session_is_read_as_one(rotated: Bench, tmp_path: Path) -> Non
         assert whole.end["reason"] == "session closed" and not whole.truncated
         with pytest.raises(IndexError):
             whole.record(60)
+    t_ns = whole.columns("inputs.t_ns")["inputs.t_ns"]
+    near = whole.around(int(t_ns[30]), 24_000_000)
+    ticks = near.columns("inputs.tick")["inputs.tick"].tolist()
+    assert set(range(27, 33)) <= set(ticks) and ticks == list(range(ticks[0], ticks[-1] + 1)) and len(ticks) < 60
+    assert near.record(0) == rotated.packed[ticks[0]] and whole.cycles == 60
     alone = open_recording(part_path(rotated.out, 2))
     assert len(alone.parts) == 1 and alone.cycles < 60
     report, _ = audit(rotated.out, sample=1)

@@ -26,10 +26,13 @@ STAMPS = (
 class Feed:
     """A recorded minute or so, again and again, each time later."""
 
-    def __init__(self, recording: Any, cycles: list[Any]) -> None:
+    def __init__(self, recording: Any, cycles: list[Any], period_ns: int) -> None:
+        """`period_ns`: the pace of the loop; the recorded stamps are moved to it."""
         packed = b"".join(recording.packed(cycles))
         self.records = np.frombuffer(bytearray(packed), recording.layout.dtype)
-        self.span_ns = len(self.records) * recording.params.period_ns
+        self.span_ns = len(self.records) * period_ns
+        for path in STAMPS:
+            self.records[path] -= np.arange(len(self.records)) * (recording.params.period_ns - period_ns)
 
     def later(self, turn: int) -> list[bytes]:
         block = self.records.copy()
@@ -42,7 +45,7 @@ class Feed:
 
 def endure(recording: Any, core_session: tuple[Path, list[Any]], folder: Path, period_ns: int, seconds: float) -> float:
     """Record so long; the share of a core that the logger took. The log is `folder / log.mcap`."""
-    feed, now = Feed(recording, core_session[1]), [0]
+    feed, now = Feed(recording, core_session[1], period_ns), [0]
     ring.create(folder / "ring", recording.layout.size, 2000)
     ring.create(ring.wire_path(folder / "ring"), 600, 4000)
     display = Display(recording.params, recording.layout)

@@ -156,3 +156,16 @@ def test_truth_that_is_none_is_one_clear_line(recording: Any) -> None:
     path = recording.write(recording.packed(recording.cycles(5)), [(schema.TRUTH, T0_NS + 1, {"foreign": 1})])
     with pytest.raises(LogError, match="/sim/truth"):
         summarise(path)
+
+
+def test_photon_to_command_is_from_the_oldest_capture_to_the_sending(recording: Any) -> None:
+    """Data 30 ms old at freezing; sending follows as the fixture dates it. Two cycles with a second, older sensor."""
+    cycles = recording.cycles(50)
+    for at in (10, 11):
+        state, x, out, receipt, timings = cycles[at]
+        older = dataclasses.replace(x.sensors[0], id=2, age_ns=75_000_000)
+        cycles[at] = (state, dataclasses.replace(x, sensors=(*x.sensors, older)), out, receipt, timings)
+    found = summarise(recording.write(recording.packed(cycles)))["photon_to_command_ms"]
+    assert 30.0 <= found["p50"] < 38.0 and found["max"] == pytest.approx(found["p50"] + 45.0)
+    assert sum(count for _, count in found["histogram"]) == 48, "the first two cycles knew of nobody"
+    assert found["histogram"][0] == [30.0, 46] and found["histogram"][-1] == [70.0, 2]

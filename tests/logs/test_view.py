@@ -107,7 +107,7 @@ def test_plots_are_the_recorded_numbers(recording: Any, tmp_path: Path) -> None:
 
 
 def test_where_there_is_no_pair_the_plots_have_a_gap(recording: Any, tmp_path: Path) -> None:
-    none = Pairs(*(np.zeros(0, np.int64),) * 2, *(vector([]),) * 8, np.zeros(0, np.int64))
+    none = Pairs(*(np.zeros(0, np.int64),) * 2, *(vector([]),) * 8, *(np.zeros(0, np.int64),) * 2)
     edit: Edit = lambda i, s, x, out: (s, x, with_decision(out, pairs=none, d_measured=np.inf))  # noqa: E731
     found = content(rrd_of(recording, tmp_path, edited(recording, 10, edit)))
     assert np.isnan(scalars(found["plot/distance"])[:, :2]).all()
@@ -155,7 +155,7 @@ def judged_by_the_core(recording: Any, seed: int) -> Edit:
         pairs = separation(model.chain, model.capsules, people, q, np.zeros(6), np.inf, 0.0)
         nearest = np.argsort(pairs.d)[:10]
         d = vector(pairs.d[nearest])
-        shown = Pairs(pairs.robot[nearest], pairs.human[nearest], d, *[d] * 7, np.zeros(10, np.int64))
+        shown = Pairs(pairs.robot[nearest], pairs.human[nearest], d, *[d] * 7, *[np.zeros(10, np.int64)] * 2)
         return dataclasses.replace(state, q_cmd=q), dataclasses.replace(x, human=human), with_decision(out, pairs=shown)
 
     return edit
@@ -332,7 +332,7 @@ def test_camera_images_are_shown_beside_the_scene(recording: Any, tmp_path: Path
     assert found["camera/left"]["t"] == [2.0]
     assert found["camera/left"]["meter"] == [[1000.0]]  # depth
     assert "blob" in found["camera/right"] and "meter" not in found["camera/right"]
-    assert layout(recording.params, 1.0, cameras=("camera/left",)) is not None
+    assert layout(recording.params, (0.0, 1.0), cameras=("camera/left",)) is not None
 
 
 def test_a_thinned_scene_keeps_the_nearest_cycle(recording: Any, tmp_path: Path) -> None:
@@ -370,6 +370,16 @@ def test_a_moment_outside_the_session_is_refused(recording: Any, tmp_path: Path,
 def test_a_moment_without_a_picture_is_refused(recording: Any) -> None:
     with pytest.raises(ViewError, match="--shot"):
         view(recording.write(recording.packed(recording.cycles(10))), at=0.01)
+
+
+def test_a_picture_draws_its_surroundings_on_the_clock_of_the_session(recording: Any, tmp_path: Path) -> None:
+    log = open_recording(recording.write(recording.packed(recording.cycles(60))))
+    moment_ns = int(log.columns("inputs.t_ns")["inputs.t_ns"][40])
+    write_rrd(log, tmp_path / "x.rrd", moment_ns, log.around(moment_ns, 40_000_000))
+    found = content(tmp_path / "x.rrd")
+    times = found["plot/distance"]["t"]
+    assert times[0] <= 0.28 and times[0] > 0.2 and 0.352 <= times[-1] < 0.45  # 0.32 s and 0.04 s around it
+    assert found["events"]["t"][-1] == pytest.approx(59 * 0.008)  # how the session ended belongs to every picture
 
 
 def test_a_window_needs_a_display(recording: Any, monkeypatch: pytest.MonkeyPatch) -> None:

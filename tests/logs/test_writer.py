@@ -1,5 +1,6 @@
 """The logger moves rings and bus into a file, and nothing is lost whoever dies."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from asc_rt import ring, topics
 from asc_rt.bus import open_router
@@ -21,7 +24,7 @@ from logs import schema
 from logs.context import attachments, session
 from logs.reader import open_log
 from logs.session_files import SessionFiles
-from logs.writer import FLUSH_NS, Logger, state_message
+from logs.writer import FLUSH_NS, Logger, joints_message, state_message
 
 
 class Clock:
@@ -135,6 +138,16 @@ def test_the_state_message_is_the_newest_cycle(recording: Any) -> None:
     assert nobody["d_min_now"] is None
 
 
+def test_the_joints_message_is_every_sample_of_the_cycles(recording: Any) -> None:
+    cycles = recording.cycles(5)
+    message = joints_message(recording.layout, recording.packed(cycles))
+    heard = [x.joint for _, x, *_ in cycles if x.joint is not None]
+    assert message["t_ns"] == [joint.t_rx_ns for joint in heard]
+    assert np.array_equal(message["q"], [joint.q for joint in heard])
+    silent = recording.packed([(b, dataclasses.replace(x, joint=None), *rest) for b, x, *rest in cycles])
+    assert joints_message(recording.layout, silent) == {}
+
+
 # --- the process -----------------------------------------------------------------------------------------------------
 
 
@@ -169,12 +182,15 @@ def test_the_process_records_a_session(recording: Any, session_ring: Path, tmp_p
             wait_until(lambda: state.take() is not None)  # so it runs, and listens
             for record in packed[1:]:
                 cycles.put(record)
-            bus.publisher(topics.HUMAN.key).put(human)
+            bus.publisher(topics.human("person").key).put(human)
             bus.publisher(topics.PLANT_TRUTH.key).put_json({"distance_m": None, "approach_m_s": 0.0, "contact": False})
             for name in ("left", "left", "no good name", "right"):
                 image = schema.CompressedImage(frame_id=name, format="png", data=b"image of " + name.encode())
                 bus.publisher(topics.CAMERA.key).put(image.SerializeToString())
+                lens = schema.CameraCalibration(frame_id=name, width=640, height=480, K=range(9))
+                bus.publisher(topics.CAMERA_CALIBRATION.key).put(lens.SerializeToString())
             bus.publisher(topics.CAMERA.key).put(b"\xff")
+            bus.publisher(topics.CAMERA_CALIBRATION.key).put(b"\xff")
             bus.event_publisher(topics.OPERATOR.key).put_json({"id": 1, "kind": "ARM"})
             wait_until(lambda: '"tick": 39' in (state.take() or b"").decode())
             wait_until(lambda: b"".join(m.data for m in open_log(out).messages("/cell/operator")))
@@ -192,7 +208,10 @@ def test_the_process_records_a_session(recording: Any, session_ring: Path, tmp_p
     assert [m.data for m in log.messages("/cell/human")] == [human]
     assert [json.loads(m.data)["id"] for m in log.messages("/cell/operator")] == [1]
     assert len(list(log.messages("/sim/truth"))) == 1
-    assert sorted(t for t in log.topics if t.startswith(schema.CAMERAS)) == ["/cell/camera/left", "/cell/camera/right"]
+    eyes = [f"/cell/camera/{name}" for name in ("left", "left/calibration", "right", "right/calibration")]
+    assert sorted(t for t in log.topics if t.startswith(schema.CAMERAS)) == eyes
+    lens, _ = (schema.CameraCalibration.FromString(m.data) for m in log.messages(eyes[1]))
+    assert (lens.width, lens.height, list(lens.K)) == (640, 480, list(range(9)))
     seen = [schema.CompressedImage.FromString(m.data) for m in log.messages("/cell/camera/left")]
     assert [(image.format, image.data) for image in seen] == [("png", b"image of left")] * 2
     assert not log.truncated
@@ -214,3 +233,10 @@ def test_bad_input_is_one_clear_line(recording: Any, session_ring: Path, tmp_pat
         assert want in errors
         assert errors.count("\n") == 1
     assert not os.path.exists(tmp_path / "a.mcap")
+
+
+@given(t_ns=st.integers(-(2**63), 2**63 - 1), data=st.binary(max_size=300), more=st.integers(0, 70_000))
+def test_a_packet_is_written_as_the_protobuf_library_would(t_ns: int, data: bytes, more: int) -> None:
+    length = len(data) + more
+    expected = schema._Wire(t_ns=t_ns, length=length, data=data).SerializeToString()
+    assert schema.wire_message(t_ns, length, data) == expected

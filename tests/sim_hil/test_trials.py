@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from scipy.stats import beta
 
@@ -20,17 +21,21 @@ from asc_rt.core.kinematics import forward
 from asc_rt.core.system import System, initial
 from asc_rt.core.types import CommandKind, JointCommand, vector
 from asc_rt.trials import run_trials
+from logs.recording import open_recording
+from logs.replay import replay
 from sim_hil.person import Capsules, Person
 from sim_hil.plant import MujocoPlant
-from sim_hil.trials import episode, report, suites
+from sim_hil.trials import episode, main, report, suites
 from sim_hil.trials.episode import Setup
 from sim_hil.trials.judge import Judge, Outcome
 from sim_hil.trials.planner import Planner
+from sim_hil.trials.results import Results
 from sim_hil.trials.scenarios import FREE, goal_and_obstacle, rng_of
 from sim_hil.trials.sensing import Ball, Blind, Camera
-from sim_hil.trials.statistics import upper_bound
+from sim_hil.trials.statistics import paired_events, paired_median, upper_bound
 from sim_hil.trials.suites import CAMERA, SUITES, TABLE1, TRANSFER, Job
 from sim_hil.trials.tasks import ATTEMPTS, PATIENCE, Rounds, Visit
+from sim_hil.trials.transfer import Verdict, verdict
 
 ROOT = Path(__file__).parents[2]
 PANDA = TABLE1[2]
@@ -61,6 +66,20 @@ def test_the_upper_bound_of_certainty_and_of_nonsense() -> None:
     for events, trials in [(0, 0), (-1, 5), (6, 5)]:
         with pytest.raises(ValueError, match="trials"):
             upper_bound(events, trials)
+
+
+def test_paired_events_count_only_the_draws_that_differ() -> None:
+    ours, other = [False] * 9 + [True], [True] * 8 + [False, True]
+    found = paired_events(ours, other)
+    assert found == {"only_asc": 0, "only_other": 8, "p": pytest.approx(2 * 0.5**8)}
+    assert paired_events([True, False], [True, False])["p"] == 1.0
+
+
+def test_paired_medians_are_of_the_differences_not_the_difference_of_medians() -> None:
+    found = paired_median([1.0, 2.0, 9.0], [2.0, 4.0, 4.0])
+    assert found is not None and found["median"] == 1.0 and found["draws"] == 3
+    assert paired_median([1.0, 2.0], [1.0, 2.0]) == {"draws": 2, "median": 0.0, "p": 1.0}
+    assert paired_median([], []) is None
 
 
 # --- sensing ---------------------------------------------------------------------------------------------------------
@@ -189,7 +208,7 @@ class Recorder:
 def test_a_set_point_arrives_one_command_latency_late() -> None:
     system = System(TRANSFER[6].params())  # LR Mate: 60 ms, 7.5 periods
     plant = Recorder(system.n)
-    arm = episode._Arm(plant, system)  # type: ignore[arg-type]
+    arm = episode.Arm(plant, system)  # type: ignore[arg-type]
     for k in range(12):
         q = vector(np.full(system.n, float(k)))
         arm.send(JointCommand(k, CommandKind.POSITION, q, q, q, False))
@@ -300,9 +319,68 @@ def test_a_moving_person_is_never_approached_inside_d_min_and_the_command_says_s
     assert (filtered["policy"], blind["policy"]) == ("asc", "none")
     assert filtered["robot_caused"] == filtered["limits_exceeded"] == 0 and filtered["reached"] > 5
     assert blind["robot_caused"] == 1
-    lines = [json.loads(line) for line in Path(result["logs"][0]).read_text().splitlines()]
-    assert len(lines) == 2 and lines[0]["trial"] == 0
+    assert filtered["needed"] == 1.0 and blind["paired"]["robot_caused"]["only_other"] == 1
+    table = pq.read_table(result["logs"][1]).to_pylist()
+    assert [(row["policy"], row["trial"], row["robot_caused"]) for row in table] == [("asc", 0, 0), ("none", 0, 1)]
     assert "2 of 2 trials" in done.stderr
+
+
+def run_command(*arguments: str) -> tuple[int, dict[str, Any], str]:
+    done = subprocess.run(command(*arguments, "--json", "-j", "1"), capture_output=True, text=True, cwd=ROOT)
+    return done.returncode, json.loads(done.stdout.splitlines()[-1]) if done.stdout else {}, done.stderr
+
+
+def test_a_campaign_is_gone_on_with_and_other_trials_are_kept_out(tmp_path: Path) -> None:
+    few = ("table1", "--policy", "none", "--system", "panda_5dof+ee1", "-o", str(tmp_path))
+    code, first, _ = run_command(*few, "-n", "1")
+    assert (code, first["rows"][0]["trials"]) == (0, 1)
+    journal = tmp_path / "table1.jsonl"
+    before = journal.read_text()
+    journal.write_text(before + '{"suite": "table1", "sys')  # killed while it wrote
+    code, second, told = run_command(*few, "-n", "2")
+    assert (code, second["rows"][0]["trials"], second["complete"]) == (0, 2, True)
+    assert "1 of 2 trials were done before" in told and journal.read_text().startswith(before)
+    assert pq.read_table(tmp_path / "table1.parquet").num_rows == 2
+    code, _, told = run_command(*few, "-n", "2", "--seed", "1")
+    assert code == 2 and "seed" in told and len(told.splitlines()) == 1
+
+
+def test_results_come_back_as_they_were(tmp_path: Path, outcomes: dict[Job, Outcome]) -> None:
+    results = Results(tmp_path, "table1", 0)
+    for pair in outcomes.items():
+        results.add(*pair)
+    assert Results(tmp_path, "table1", 0).done == list(outcomes.items())
+
+
+def test_a_killed_campaign_loses_only_what_was_running(tmp_path: Path) -> None:
+    arguments = ("table1", "-n", "40", "-j", "1", "--policy", "none", "--system", "panda_5dof+ee1", "-o", str(tmp_path))
+    run = subprocess.Popen(command(*arguments), cwd=ROOT, stderr=subprocess.DEVNULL)
+    journal = tmp_path / "table1.jsonl"
+    while run.poll() is None and (not journal.exists() or journal.read_text().count("\n") < 3):
+        time.sleep(0.02)
+    run.kill()
+    run.wait()
+    assert len(Results(tmp_path, "table1", 0).done) >= 2
+
+
+def test_one_trial_is_run_again_and_recorded_for_view_and_replay(tmp_path: Path) -> None:
+    one = ("--system", "lrmate_200id+drill", "--policy", "asc", "--trial", "3", "--record", "-o", str(tmp_path))
+    assert run_command("transfer", *one)[0] == 0
+    log = open_recording(tmp_path / "transfer-lrmate_200id+drill-asc-0-3.mcap")
+    report = replay(log)
+    assert report.exact and report.mismatches == 0 and report.cycles > 100
+    assert len(list(log.messages("/sim/truth"))) == report.cycles
+
+
+def test_a_dask_cluster_runs_the_same_trials() -> None:
+    from distributed import LocalCluster
+
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with LocalCluster(**options, protocol="tcp", host="127.0.0.1") as scheduler:
+        one = ("--policy", "none", "--system", "panda_5dof+ee1", "-n", "1")
+        code, there, told = run_command("table1", *one, "--cluster", scheduler.scheduler_address)
+    assert code == 0, told
+    assert {**there, "seconds": 0} == {**run_command("table1", *one)[1], "seconds": 0}
 
 
 @pytest.mark.parametrize(
@@ -311,13 +389,31 @@ def test_a_moving_person_is_never_approached_inside_d_min_and_the_command_says_s
         (["tabel1"], "table1"),
         (["table1", "-n", "0"], "1 or more"),
         (["table1", "--seed", "-3"], "0 or more"),
+        (["table1", "--trial", "-3"], "0 or more"),
+        (["table1", "--system", "pandas"], "panda_5dof+ee1"),
+        (["table1", "--policy", "best"], "asc, none"),
+        (["table1", "--record"], "-o DIR"),
+        (["table1", "--cluster", "127.0.0.1:1"], "no Dask scheduler"),
+        (["table1", "-o", "/dev/null/x"], "/dev/null/x"),
         ([], "SUITE"),
     ],
 )
-def test_bad_usage_is_one_line(arguments: list[str], says: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_trials(arguments) == 2
+def test_bad_usage_is_one_line(
+    arguments: list[str], says: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the command's, not the test's
+    try:
+        code = main.main(arguments)
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
     out, err = capfd.readouterr()
     assert out == "" and says in err and len(err.splitlines()) == 1
+
+
+def test_the_command_line_hands_over_to_the_simulators_process(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_trials(["tabel1"]) == 2
+    assert "table1" in capfd.readouterr().err
 
 
 def test_a_killed_run_leaves_no_worker_behind() -> None:
@@ -357,3 +453,28 @@ def is_alive(pid: int) -> bool:
 @pytest.mark.parametrize("suite", list(SUITES))
 def test_the_whole_suite_keeps_the_promise(suite: str) -> None:
     assert subprocess.run(command(suite, "--json"), cwd=ROOT).returncode == 0
+
+
+# --- transfer --------------------------------------------------------------------------------------------------------
+
+
+def test_the_index_is_covered_where_the_states_on_its_surface_have_a_control_and_refused_elsewhere() -> None:
+    own = verdict(TRANSFER[0], 30_000)
+    assert own.is_covered and own.boundary_states == own.feasible > 10_000 and own.M_min > 0.0
+    refused = verdict(next(s for s in TRANSFER if s.name == "lrmate_200id+drill"), 30_000)
+    assert not refused.is_covered and refused.feasible < refused.boundary_states
+    assert "states on phi = 0 have no control within the real limits" in refused.reasons[0]
+
+
+def test_nothing_is_promised_where_the_index_does_not_cover_the_system(
+    outcomes: dict[Job, Outcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad = dataclasses.replace(next(iter(outcomes.values())), violations=1, robot_caused=1)
+    for reasons, promised in (((), True), (("7 of 9 states",), False)):
+        monkeypatch.setattr(report, "verdict", lambda _, r=reasons: Verdict(9, 2, -1.0, r))
+        done = [(Job("transfer", 4, "asc", 0, 0), bad)]
+        (row,) = report.rows("transfer", done)
+        assert (row["covered"], row["refused"]) == (promised, list(reasons))
+        assert (row["boundary_states"], row["boundary_feasible"], row["robot_caused"]) == (9, 2, 1)
+        assert report.holds("transfer", [row]) is not promised
+        assert bool(report.broken_promises(done)) is promised

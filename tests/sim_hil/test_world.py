@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import socket
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,8 +24,9 @@ from asc_rt import topics
 from asc_rt.bus import Bus, BusError, Latest, open_client, open_router
 from asc_rt.core.params import Params
 from sim_hil import human
-from sim_hil.human import HumanOptions, HumanSource, Rhythm, body, boot_id, publish
+from sim_hil.human import HumanOptions, HumanSource, Rhythm, body, clock_id, publish
 from sim_hil.person import Capsules, Person
+from sim_hil.plant import MujocoPlant
 from sim_hil.world import LONGEST_EXTRAPOLATION, World, decode, extrapolate
 
 ROOT = Path(__file__).parents[2]
@@ -77,11 +80,11 @@ def test_sensed_is_late_bounded_healthy_and_counted() -> None:
     options = HumanOptions(seed=4, latency_ms=25.0, position_bound_m=0.03, velocity_bound_m_s=0.4)
     source = HumanSource(options, start_ns=0)
     source.truth(1)
-    first, second = (pb.HumanState.FromString(source.sensed(t)) for t in (6_000_000_000, 6_016_000_000))
+    first, second = (pb.HumanState.FromString(source.sensed(t) or b"") for t in (6_000_000_000, 6_016_000_000))
     assert (first.seq, second.seq) == (1, 2)
     assert first.t_publish_ns - first.t_capture_ns == 25_000_000
     assert first.session_uuid == second.session_uuid != ""
-    assert first.clock_id == f"HOST_MONO:{boot_id()}"
+    assert first.clock_id == clock_id()
     assert first.method == pb.METHOD_SIMULATED and not first.safety_rated
     assert first.health == pb.HEALTH_OK and first.empty_certified and first.coverage == 1.0
     assert (first.schema_version, first.frame_id, first.calibration_hash) == (1, "robot_base", b"")
@@ -96,7 +99,7 @@ def test_sensed_is_late_bounded_healthy_and_counted() -> None:
         ({"sed": 1}, "sim.human.sed"),
         ({"seed": 1.5}, "integer"),
         ({"seed": True}, "integer"),
-        ({"rate_hz": 0}, "1..1000"),
+        ({"rate_hz": 0.5}, "1..1000"),
         ({"latency_ms": -1}, "sim.human.latency_ms"),
         ({"start_s": math.nan}, "sim.human.start_s"),
         ({"position_bound_m": "2 cm"}, "sim.human.position_bound_m"),
@@ -109,7 +112,7 @@ def test_wrong_options_are_named(table: dict[str, Any], word: str) -> None:
 
 def test_every_wrong_option_at_once() -> None:
     with pytest.raises(ValueError) as caught:
-        HumanOptions.of({"sed": 1, "latency_ms": -1, "rate_hz": 0})
+        HumanOptions.of({"sed": 1, "latency_ms": -1, "rate_hz": 0.5})
     assert len(str(caught.value).splitlines()) == 3
 
 
@@ -156,7 +159,7 @@ def test_the_command_says_ready_and_ends_on_sigterm(router: Bus, endpoint: str) 
     try:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready human")
-        wait_for(router.latest(topics.HUMAN.key))
+        wait_for(router.latest(topics.human("person").key))
         process.terminate()
         _, errors = process.communicate(timeout=30)
     finally:
@@ -180,7 +183,7 @@ def test_without_a_bus_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytes
         raise BusError(f"nobody listens on bus.endpoint {endpoint}", "start it with `asc run`")
 
     monkeypatch.setattr(human, "open_client", nobody)
-    monkeypatch.setattr(human.signal, "signal", lambda *_: None)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
     assert human.main("fanuc-sim", []) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -224,7 +227,7 @@ def test_what_cannot_be_shown_is_not_decoded(data: bytes) -> None:
 def test_the_world_shows_the_person_and_tells_the_truth(
     router: Bus, endpoint: str, arm_params: Callable[[str], Params]
 ) -> None:
-    world = World(Cell(arm_params("drill"), endpoint), READY)
+    world = World(Cell(arm_params("drill"), endpoint), "fanuc", READY)
     mail, person_publisher = router.latest(topics.PLANT_TRUTH.key), router.publisher(topics.PERSON_TRUTH.key)
     try:
         alone = json.loads(wait_for(mail, say=lambda: (world.step(), world.publish(42))))
@@ -258,3 +261,21 @@ def test_the_world_shows_the_person_and_tells_the_truth(
             assert after["person_part"] == "left_hand"
     finally:
         world.close()
+
+
+def test_in_short_periods_the_truth_is_told_as_often_as_its_topic_says_and_no_contact_is_lost(
+    router: Bus, endpoint: str, arm_params: Callable[[str], Params], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    params = dataclasses.replace(arm_params("drill"), period_ns=2_000_000)
+    world = World(Cell(params, endpoint), "fanuc", READY)
+    told: list[dict[str, Any]] = []
+    monkeypatch.setattr(world, "_truth", SimpleNamespace(put_json=told.append))
+    monkeypatch.setattr(MujocoPlant, "contacts", property(lambda _: ("one",) if world._periods in (2, 12) else ()))
+    try:
+        for t_ns in range(12):
+            world.set_target(READY)
+            world.step()
+            world.publish(t_ns)
+    finally:
+        world.close()
+    assert [(truth["t_ns"], truth["contact"]) for truth in told] == [(3, True), (7, False), (11, True)]

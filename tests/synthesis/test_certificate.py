@@ -77,6 +77,7 @@ REFUSED: dict[str, tuple[Callable[[Params], Params], str]] = {
     "d_min smaller": (safety(d_min=0.05), "safety.d_min_m = 0.05, certified for 0.1"),
     "d_min larger": (safety(d_min=0.2), "safety.d_min_m = 0.2, certified for 0.1"),
     "activation": (safety(activation_distance=1.5), "safety.activation_m = 1.5 is beyond"),
+    "faster approach": (safety(v_max=3.0), "safety.v_max_m_s = 3 is above the certified 2"),
     "floor": (safety(M_floor=0.1), "safety.M_floor = 0.1 is under the certified 0.3"),
     "eta": (safety(eta=2.0), "safety.eta = 2 is above the certified 1"),
     "person": (safety(human_acceleration=30.0), "human_acceleration_m_s2 = 30 is above the certified"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -97,6 +99,31 @@ def test_memory_does_not_grow_with_the_number_of_samples(survey: Survey) -> None
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.3 * peaks[0]
+
+
+RSS = """
+import resource, sys
+from asc_rt.config import load_arm
+from asc_rt.core import robot_model
+from asc_rt.synthesis import sampling
+from asc_rt.synthesis.table1 import FLOOR, TRUE_RANGES
+robot, tool = load_arm("panda", "ee1")
+model = robot_model.load(robot, tool, "torque")
+draw = sampling.draw_of(model, len(tool.capsules), TRUE_RANGES)
+sampling.collect(sampling.Survey(model.arm, draw, 0, int(sys.argv[1]), FLOOR, TRUE_RANGES.v_max))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_ten_million_samples_take_no_more_memory_than_a_hundred_thousand() -> None:
+    """Of whole processes, as the kernel counts it, kB."""
+    few, many = (
+        int(subprocess.run([sys.executable, "-c", RSS, n], capture_output=True, text=True, check=True).stdout)
+        for n in ("100000", "10000000")
+    )
+    assert many < 1.1 * few
 
 
 def test_histograms_hold_everything_and_quantiles_are_near() -> None:

@@ -1,0 +1,171 @@
+"""The perception process: cameras -> HumanState on the bus. `python -m asc_rt.perception CELL`.
+
+Exit code 0: ended as asked; 1: no bus; 2: bad input, or a camera that must not be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from typing import Any
+
+import cv2
+import numpy as np
+
+from asc_rt import launch, realtime, topics
+from asc_rt.bus import Bus, BusError, Queue, open_client
+from asc_rt.clock_sync import CellClock
+from asc_rt.config import Cell, ConfigError, load_cell
+from asc_rt.core.system import System
+from asc_rt.human_codec import clock_id
+from asc_rt.perception.background import BackgroundError
+from asc_rt.perception.cameras import CameraError, Frames, Opened, Reader, observer_of, open_all
+from asc_rt.perception.sensor import Identity, Sensor
+from asc_rt.remote import join
+from drivers.cameras.base import DepthFrame
+
+PRIORITY = 20  # SCHED_FIFO, below all that moves something
+READY_NS = 500_000_000
+WAIT_S = 0.01  # for the next frame
+TOGETHER = 0.4  # of a period, for which the frame of one camera waits for the others'
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m asc_rt.perception", description="Cameras to people with bounds.")
+    parser.add_argument("cell", help="cell file or name of a cell")
+    launch.add_overrides(parser)
+    parser.add_argument("--remote", action="store_true", help="the cell runs on another machine: [bus.remote]")
+    given = parser.parse_args(argv)
+    stop = launch.told_to_end()
+    try:
+        cell = load_cell(given.cell, given.set)
+        if cell.perception is None:
+            raise ConfigError([f"{cell.path}: perception: missing; a cell that sees has a table [perception]"])
+        with join(cell, cell.perception.sensor) if given.remote else open_client(cell.bus_endpoint) as bus:
+            run(cell, bus, CellClock(bus) if given.remote else None, stop)
+    except (ConfigError, CameraError) as error:
+        return _refuse(error.lines, 2)
+    except BackgroundError as error:
+        return _refuse([str(error)], 2)
+    except BusError as error:
+        return _refuse([f"{error}; {error.hint}"], 1)
+    return 0
+
+
+def run(cell: Cell, bus: Bus, clock: CellClock | None, stop: Sequence[int]) -> None:
+    """Until `stop` is not empty. CameraError, BackgroundError."""
+    assert cell.perception is not None
+    cv2.setNumThreads(1)
+    opened = open_all(cell.perception, stop)
+    with ExitStack() as stack:
+        for one in opened:
+            stack.callback(one.camera.close)
+        frames: Frames = queue.SimpleQueue()
+        for i, one in enumerate(opened):
+            stack.callback(Reader(i, one, frames, _tell).close)
+        warm_up(sensor_of(cell, opened, clock), cell)
+        sensor = sensor_of(cell, opened, clock)
+        realtime.set_up(PRIORITY, None)
+        _Loop(cell, bus, sensor, frames).run(stop)
+
+
+def sensor_of(cell: Cell, opened: Sequence[Opened], clock: CellClock | None = None) -> Sensor:
+    """`clock`: of the cell, where it runs on another machine. BackgroundError."""
+    options = cell.perception
+    assert options is not None
+    observer, eyes = observer_of(options, opened, System(cell.params).model, len(cell.params.human.sensors))
+    (number,) = [sensor.id for sensor in cell.params.human.sensors if sensor.name == options.sensor]
+    identity = Identity(number, options.digest, options.margin, options.detection)
+    if clock is None:
+        return Sensor(identity, eyes, observer, clock_id, lambda t_ns: (t_ns, 0))
+    return Sensor(identity, eyes, observer, lambda: clock.id, clock.convert)
+
+
+def warm_up(sensor: Sensor, cell: Cell) -> None:
+    """Compiles and loads what the first picture would wait for. `sensor` has lived now."""
+    for t_ns in (0, 1):
+        sensor.observer.observe(t_ns, [eye.view.background for eye in sensor.eyes], np.zeros(cell.params.n))
+    sensor.observer.observe(2, [None] * len(sensor.eyes), np.zeros(cell.params.n))
+
+
+class _Loop:
+    def __init__(self, cell: Cell, bus: Bus, sensor: Sensor, frames: Frames) -> None:
+        assert cell.perception is not None
+        self._sensor, self._frames, self._n = sensor, frames, cell.params.n
+        self._people = bus.publisher(topics.human(cell.perception.sensor).key)
+        self._ready = bus.publisher(topics.ready(topics.PERCEPTION).key)
+        self._joints = bus.queue(topics.JOINTS.key)
+        self._together_ns = round(TOGETHER * min(eye.info.period_ns for eye in sensor.eyes))
+        self._told_ns = 0
+        self._fault = sensor.fault
+
+    def run(self, stop: Sequence[int]) -> None:
+        waiting: dict[int, DepthFrame] = {}
+        while not stop:
+            self._collect(waiting)
+            now_ns = time.monotonic_ns()
+            hear(self._joints, self._sensor, self._n)
+            if self._is_whole(waiting, now_ns):
+                messages = self._sensor.take(waiting, now_ns)
+                waiting.clear()
+            else:
+                messages = self._sensor.wait(now_ns)
+            for message in messages:
+                self._people.put(message)
+            self._say(now_ns)
+
+    def _collect(self, waiting: dict[int, DepthFrame]) -> None:
+        """The newest frame of each camera."""
+        with suppress(queue.Empty):
+            number, frame = self._frames.get(timeout=WAIT_S)
+            waiting[number] = frame
+            while True:
+                number, frame = self._frames.get_nowait()
+                waiting[number] = frame
+
+    def _is_whole(self, waiting: dict[int, DepthFrame], now_ns: int) -> bool:
+        """A frame of every camera in order, or one that has waited for long enough."""
+        if not waiting:
+            return False
+        missing = [i for i, eye in enumerate(self._sensor.eyes) if eye.is_believed and i not in waiting]
+        oldest_ns = min(frame.t_arrival_ns for frame in waiting.values())
+        return not missing or now_ns - oldest_ns > self._together_ns
+
+    def _say(self, now_ns: int) -> None:
+        if now_ns - self._told_ns > READY_NS:
+            self._told_ns = now_ns
+            self._ready.put_json({"pid": os.getpid()})
+        if self._sensor.fault != self._fault:
+            self._fault = self._sensor.fault
+            names = {eye.name: eye.fault.name or "in order" for eye in self._sensor.eyes}
+            _tell("; ".join(f"camera {name}: {fault}" for name, fault in names.items()))
+
+
+def hear(inbox: Queue, sensor: Sensor, n: int) -> None:
+    """Takes over the joints that have come. What is no batch of them is as good as none."""
+    while (data := inbox.take()) is not None:
+        try:
+            told: dict[str, Any] = json.loads(data)
+            q = np.array(told["q"], float).reshape(-1, n)
+            times = [int(t_ns) for t_ns in told["t_ns"]]
+        except (ValueError, KeyError, TypeError, OverflowError):
+            continue
+        if np.isfinite(q).all() and len(q) == len(times):
+            for t_ns, row in zip(times, q, strict=True):
+                sensor.joints.add(t_ns, row)
+
+
+def _tell(line: str) -> None:
+    print(f"perception: {line}", file=sys.stderr, flush=True)
+
+
+def _refuse(lines: Sequence[str], code: int) -> int:
+    for line in lines:
+        _tell(line)
+    return code

@@ -1,0 +1,151 @@
+"""From power on to holding still: a list of lines, each with a verdict. The first part enables nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from asc_rt.core.types import Vector
+from drivers.base import Dynamics, Finding, HandshakeError, LinkError, RobotFaulted
+from drivers.can import bus_load, home
+from drivers.can.arm import ArmCodec, Power, Target, Wish
+from drivers.can.link import Link
+from drivers.can.options import Options
+from drivers.can.stream import Stream, hold, look
+
+BUS = "robot"  # name of the line that says whether anybody is there
+LISTENED = 16  # frames of others that are told by identifier
+REHEARSAL = 50  # cycles before anything is enabled
+LOSSES = 2  # answers of one axis that may be lost meanwhile
+SETTLE = 15  # cycles
+ENABLE_CYCLES = 25  # for one axis
+SEED = 0.005  # rad between two looks at an arm that stands still
+SAG = 0.05  # rad that the arm may give way when it is enabled
+
+
+def examine(link: Link, codec: ArmCodec, options: Options, period_ns: int) -> Iterator[Finding]:
+    """Opens the link and leaves it open. Raises nothing of the wire's."""
+    try:
+        link.open()
+    except LinkError as error:
+        yield Finding(BUS, False, str(error), error.hint)
+        return
+    yield Finding(BUS, True, f"{options.interface} {options.channel} is open")
+    yield _load(codec, period_ns)
+    yield _silence(codec)
+    yield _listen(link, options)
+    yield from codec.start_up(link, period_ns, options.serials)
+    h = link.health
+    wrong = [name for name in ("passive", "off", "unacknowledged", "backlog", "gone") if getattr(h, name)]
+    yield Finding("bus state", not wrong, ", ".join(wrong) or "error active", "check termination, cabling and power")
+
+
+def _load(codec: ArmCodec, period_ns: int) -> Finding:
+    share = bus_load.load(codec.budget(), period_ns * 1e-9, codec.bitrate, codec.data_bitrate)
+    rate = f"{codec.bitrate * 1e-6:g}" + (f"/{codec.data_bitrate * 1e-6:g}" if codec.data_bitrate else "")
+    detail = f"{share:.1%} of {rate} Mbit/s in the worst case, at most {bus_load.LIMIT:.0%}"
+    return Finding("bus load", share <= bus_load.LIMIT, detail, "a longer period_ms, fewer axes, or CAN FD")
+
+
+def _silence(codec: ArmCodec) -> Finding:
+    """What happens when this PC dies: an axis without brake must not go limp."""
+    falls = [i + 1 for i, joint in enumerate(codec.joints) if not joint.has_brake and not joint.holds_on_silence]
+    detail = f"axes {falls} have no brake and go limp" if falls else "every axis has a brake, or holds by itself"
+    return Finding("when this PC dies", not falls, detail, "fit brakes, or drives that hold when nobody talks to them")
+
+
+def _listen(link: Link, options: Options) -> Finding:
+    """Another master would command the same drives."""
+    heard: list[int] = []
+    deadline_ns = link.now_ns() + round(options.listen_s * 1e9)
+    while (frame := link.receive(deadline_ns)) is not None:
+        if not 0x700 <= frame.id < 0x780:  # heartbeats and boot-ups of CANopen
+            heard.append(frame.id)
+    ids = ", ".join(f"{i:03X}h" for i in sorted(set(heard))[:LISTENED])
+    return Finding("listen", not heard, f"others send {ids}" if heard else "silence", "take the other master off")
+
+
+def enable(stream: Stream, options: Options, dynamics: Dynamics) -> Iterator[Finding]:
+    """Rehearse, seed, enable axis by axis, hold. HandshakeError: a line fails; RobotFaulted: a fault meanwhile."""
+    yield _rehearse(stream)
+    q = _seed(stream)
+    yield _checked(home.check(options.home, q, tuple(stream.codec.joints)))
+    for i in range(len(q)):
+        _cycle(stream, hold(q, _weight(dynamics, q)))
+        yield _checked(stream.codec.guard(stream.link, i, round(options.watchdog_ms * 1e6)))
+        stream.pause()
+    for _ in range(SETTLE):  # heartbeats are heard again
+        _cycle(stream, hold(q, _weight(dynamics, q)))
+    for i in range(len(q)):
+        yield _enable_axis(stream, i, q, dynamics)
+    for _ in range(max(1, round(options.hold_s * 1e9 / stream.period_ns))):
+        _cycle(stream, hold(q, _weight(dynamics, q)))
+    sag = float(np.max(np.abs(stream.pose()[0] - q)))
+    fix = "support the arm; check brakes, payload and gains"
+    yield _checked(Finding("hold", sag <= SAG, f"gave way {sag * 1e3:.1f} mrad, at most {SAG * 1e3:.0f}", fix))
+
+
+def _rehearse(stream: Stream) -> Finding:
+    """The cycle as it will be, without commanding anything: losses show here, not in motion."""
+    stream.pause()
+    for _ in range(REHEARSAL):
+        _cycle(stream, look(len(stream.axes)))
+    powers = stream.powers()
+    may = (Power.DISABLED, Power.ENABLED)  # enabled: an axis without brake, as the last session left it
+    wrong = [
+        f"axis {i + 1}: {axis.feedback.words if axis.feedback else 'silent'}"
+        for i, (axis, power) in enumerate(zip(stream.axes, powers, strict=True))
+        if power not in may[: 1 if stream.codec.joints[i].has_brake else 2]
+    ]
+    fix = "a person looks for the cause and resets the drive: nothing is reset by itself"
+    _checked(Finding("power", not wrong, ", ".join(wrong) or "as it was left, and without fault", fix))
+    lost = max(axis.lost for axis in stream.axes)
+    detail = f"{lost} of {REHEARSAL} answers of an axis lost"
+    return _checked(Finding("rehearsal", lost <= LOSSES, detail, "check cabling and the load of this PC"))
+
+
+def _seed(stream: Stream) -> Vector:
+    """The pose to hold: measured twice, and the same."""
+    first = stream.pose()[0]
+    _cycle(stream, look(len(first)))
+    q = stream.pose()[0]
+    moved = float(np.max(np.abs(q - first)))
+    _checked(Finding("seed", moved <= SEED, f"the arm moves: {moved * 1e3:.1f} mrad in a cycle", "let it come to rest"))
+    return q
+
+
+def _enable_axis(stream: Stream, i: int, q: Vector, dynamics: Dynamics) -> Finding:
+    """The axes before it hold, those after it stay as they are."""
+    for _ in range(ENABLE_CYCLES):
+        targets = hold(q, _weight(dynamics, q))
+        targets[i] = hold(q, _weight(dynamics, q), Wish.ENABLE)[i]
+        _cycle(stream, targets)
+        if stream.powers()[i] is Power.ENABLED:
+            stream.expects_power[i] = True
+            return Finding(f"enable axis {i + 1}", True, "enabled")
+    told = stream.axes[i].feedback
+    detail = f"stays {told.words if told else 'silent'}"
+    return _checked(Finding(f"enable axis {i + 1}", False, detail, "check power and the emergency stop circuit"))
+
+
+def _cycle(stream: Stream, targets: list[Target]) -> None:
+    """One whole period. RobotFaulted."""
+    begin_ns = stream.link.now_ns()
+    stream.send(targets)
+    stream.collect(begin_ns + stream.period_ns, begin_ns + stream.period_ns)
+    if any(stream.expects_power) and stream.found:
+        raise RobotFaulted(str(stream.found[0]), hint=stream.found[0].rule.do)
+    if stream.is_cut:
+        raise RobotFaulted(str(stream.found[-1]), hint=stream.found[-1].rule.do)
+
+
+def _weight(dynamics: Dynamics, q: Vector) -> Vector:
+    zero = np.zeros_like(q)
+    return dynamics(q, zero, zero)
+
+
+def _checked(line: Finding) -> Finding:
+    if not line.ok:
+        raise HandshakeError(f"start-up refused: {line.name}: {line.detail}", hint=line.fix)
+    return line

@@ -1,0 +1,141 @@
+"""Faults of bus, drives and arm, by call or by script: each stands for something that happens in a real cell.
+
+Script entries: {at_s, fault, axis?, value?}; `axis` counts from 1, 0 is every axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+from sim_hil import fault_script
+from sim_hil.can.frames import Frame
+from sim_hil.can.line import FIRST_DRIVE, Line
+
+Action = Callable[[Line, int, float], None]  # line, drive counted from 0, value
+
+
+def _lose(line: Line, i: int, value: float) -> None:
+    line.lose[i] += round(value)
+
+
+def _late(line: Line, i: int, value: float) -> None:
+    line.late[i] = round(value * 1e6)
+
+
+def _echo(line: Line, i: int, value: float) -> None:
+    line.echo.add(i)
+
+
+def _silence(line: Line, i: int, value: float) -> None:
+    line.drives[i].is_silent = True
+
+
+def _heartbeat(line: Line, i: int, value: float) -> None:
+    line.drives[i].heart_stopped = True
+
+
+def _power_cut(line: Line, i: int, value: float) -> None:
+    """The axis is dead: no torque, no answer; a brake closes by its spring."""
+    line.drives[i].cut_power()
+    line.drives[i].is_silent = True
+
+
+def _safe_torque_off(line: Line, i: int, value: float) -> None:
+    line.drives[i].cut_power()
+
+
+def _trip(line: Line, i: int, value: float) -> None:
+    line.drives[i].trip_over_current()
+
+
+def _disable(line: Line, i: int, value: float) -> None:
+    line.drives[i].switch_off()
+
+
+def _encoder(line: Line, i: int, value: float) -> None:
+    line.drives[i].offset += value
+
+
+def _block(line: Line, i: int, value: float) -> None:
+    line.blocked.add(i)
+
+
+def _hot(line: Line, i: int, value: float) -> None:
+    line.drives[i].coil_c = value
+
+
+def _corrupt(line: Line, i: int, value: float) -> None:
+    """So many frames of every client are destroyed on the wire."""
+    for node in line.bus.clients(FIRST_DRIVE):
+        line.bus.corrupt[node] += round(value)
+
+
+def _unplug(line: Line, i: int, value: float) -> None:
+    """The cable to the drives is off: nobody acknowledges."""
+    for node in range(FIRST_DRIVE, FIRST_DRIVE + len(line.drives)):
+        line.bus.off.add(node)
+
+
+def _babble(line: Line, i: int, value: float) -> None:
+    line.babble = Frame(round(value), bytes(8))
+
+
+FAULTS: dict[str, Action] = {
+    "lose": _lose,  # value: frames of the drive
+    "late": _late,  # value: ms
+    "echo": _echo,
+    "silence": _silence,
+    "heartbeat": _heartbeat,
+    "power_cut": _power_cut,
+    "safe_torque_off": _safe_torque_off,
+    "trip": _trip,
+    "disable": _disable,
+    "encoder": _encoder,  # value: rad
+    "block": _block,
+    "hot": _hot,  # value: deg C
+    "corrupt": _corrupt,  # value: frames
+    "unplug": _unplug,
+    "babble": _babble,  # value: identifier
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    at_s: float
+    fault: str
+    axis: int = 0
+    value: float = 1.0
+
+    @classmethod
+    def parse(cls, entry: object) -> Fault:
+        """ValueError: not a fault."""
+        if not isinstance(entry, dict) or not {"at_s", "fault"} <= set(entry) <= set(_KEYS):
+            raise ValueError(f"a fault is a table with {', '.join(_KEYS)}, not {entry!r}")
+        fault = cls(**entry)
+        numbers = all(type(n) in (int, float) for n in (fault.at_s, fault.value)) and type(fault.axis) is int
+        if fault.fault not in FAULTS or not numbers or fault.at_s < 0 or fault.axis < 0:
+            raise ValueError(f"{entry} is no fault; faults: {', '.join(FAULTS)}")
+        return fault
+
+    def strike(self, line: Line) -> None:
+        """IndexError: there is no such axis."""
+        axes = range(len(line.drives)) if self.axis == 0 else [self.axis - 1]
+        for i in axes if self.fault not in _OF_THE_BUS else [0]:
+            FAULTS[self.fault](line, i, self.value)
+
+
+_OF_THE_BUS = ("corrupt", "unplug", "babble")
+
+
+parse_script = partial(fault_script.parse, kind=Fault)
+read_script = partial(fault_script.read, kind=Fault)
+heard = partial(fault_script.heard, kind=Fault)
+_KEYS = fault_script.keys(Fault)
+
+
+def due(script: list[Fault], seconds: float) -> Iterator[Fault]:
+    """Takes what has come due out of the script, which is in the order of time."""
+    while script and script[0].at_s <= seconds:
+        yield script.pop(0)

@@ -1,0 +1,99 @@
+"""The protective separation distance: the standard's sum, what it must grow with, and speeds against Pinocchio."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asc_rt.core.params import MonitorParams
+from asc_rt.core.separation_monitor import greatest_speed, protective_distance, stopping_time
+
+times, speeds, lengths = st.floats(0.0, 2.0), st.floats(0.0, 5.0), st.floats(0.0, 1.0)
+monitors = st.builds(MonitorParams, human_speed=speeds, intrusion_distance=lengths, robot_uncertainty=lengths)
+
+
+def test_the_budget_of_the_fact_sheet() -> None:
+    """Age and reaction 0.16 s, stop 0.30 s, robot 1 m/s, C 0.30, Z_d 0.04, Z_r 0.01: 1.35 m, of which S_s 0.15 m by
+    the S-curve instead of the sheet's 0.10 m."""
+    found = protective_distance(MonitorParams(1.6, 0.30, 0.01), 1.0, 0.06, 0.10, 0.30, 0.04)
+    assert found.S_h == pytest.approx(0.736)
+    assert (found.S_r, found.S_s) == pytest.approx((0.10, 0.15))
+    assert found.S_p == pytest.approx(0.736 + 0.10 + 0.15 + 0.30 + 0.04 + 0.01)
+
+
+@given(monitor=monitors, v=speeds, age=times, react=times, stop=times, z=lengths, more=st.floats(0.01, 1.0))
+def test_more_of_anything_asks_for_more_distance(
+    monitor: MonitorParams, v: float, age: float, react: float, stop: float, z: float, more: float
+) -> None:
+    now = (v, age, react, stop, z)
+    here = protective_distance(monitor, *now).S_p
+    assert math.isfinite(here) and here >= 0.0
+    for i in range(len(now)):
+        grown = [value + more * (i == k) for k, value in enumerate(now)]
+        assert protective_distance(monitor, *grown).S_p >= here
+    for name in ("human_speed", "intrusion_distance", "robot_uncertainty"):
+        worse = dataclasses.replace(monitor, **{name: getattr(monitor, name) + more})
+        assert protective_distance(worse, *now).S_p >= here
+
+
+@given(monitor=monitors, v=speeds, age=times, react=times, stop=st.floats(1e-3, 2.0), z=lengths)
+def test_it_holds_what_may_happen_until_the_robot_stands(
+    monitor: MonitorParams, v: float, age: float, react: float, stop: float, z: float
+) -> None:
+    """A person who walks straight in at v_h and a robot that meets them and brakes evenly do not touch."""
+    steps = np.linspace(0.0, react + stop, 200)
+    brakes = np.maximum(steps - react, 0.0)
+    slowing = 0.5 * v * brakes**2 / max(stop, 1e-3)
+    robot = v * steps - slowing
+    person = monitor.human_speed * (age + steps)
+    found = protective_distance(monitor, v, age, react, stop, z)
+    assert np.all(robot + person <= found.S_p - found.C - found.Z_d - found.Z_r + 1e-9)
+
+
+def test_data_from_the_future_make_no_distance_smaller() -> None:
+    assert protective_distance(MonitorParams(), 1.0, -5.0, 0.1, 0.2, 0.0).S_h == pytest.approx(1.6 * 0.3)
+
+
+@given(speed=st.floats(0.0, 6.0), A=st.floats(1.0, 100.0), J=st.floats(10.0, 2000.0))
+def test_the_stopping_time_is_that_of_ruckig(speed: float, A: float, J: float) -> None:
+    ruckig = pytest.importorskip("ruckig")
+    request = ruckig.InputParameter(1)
+    request.control_interface = ruckig.ControlInterface.Velocity
+    request.current_velocity, request.target_velocity = [speed], [0.0]
+    request.max_acceleration, request.max_jerk = [A], [J]
+    plan = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(request, plan)
+    found = stopping_time(np.array([speed]), np.array([A]), np.array([J]))
+    assert found == pytest.approx(plan.duration, rel=1e-6, abs=1e-6)
+
+
+def test_the_fastest_point_against_pinocchio(bench: Any) -> None:
+    system = bench.system()
+    rng = np.random.default_rng(3)
+    model, params = system.model.pin_model, system.params
+    data = model.createData()
+    for _ in range(20):
+        q, dq = rng.uniform(params.robot.q_min, params.robot.q_max), rng.normal(0.0, 1.0, params.n)
+        pin.forwardKinematics(model, data, q, dq)
+        pin.updateFramePlacements(model, data)
+        fastest = 0.0
+        for spec in (*params.robot.capsules, *params.tool.capsules):
+            frame = model.getFrameId(spec.link, pin.BODY)
+            v = pin.getFrameVelocity(model, data, frame, pin.LOCAL)
+            if model.frames[frame].parentJoint == 0:
+                continue
+            ends = [np.linalg.norm(v.linear + np.cross(v.angular, p)) for p in (spec.p0, spec.p1)]
+            fastest = max(fastest, max(ends) + spec.radius * float(np.linalg.norm(v.angular)))
+        assert greatest_speed(system.model.chain, system.model.capsules, q, dq) == pytest.approx(fastest, rel=1e-9)
+
+
+def test_a_speed_that_is_no_number_is_the_greatest(bench: Any) -> None:
+    system = bench.system()
+    assert greatest_speed(system.model.chain, system.model.capsules, bench.HOME, np.full(6, np.nan)) == np.inf

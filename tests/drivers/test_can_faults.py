@@ -1,0 +1,209 @@
+"""Every row of the fault table, at rest and at speed, on both kinds of drives.
+
+Asked of each: how many cycles until it is seen, what the axes do in the end, and how far the healthy ones leave the
+straight way of the coordinated stop. Gravity pulls on every joint.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from can_rig import Rig, position
+
+from asc_rt.core.types import CommandKind, JointCommand, RobotFlag, Vector, vector
+from drivers.base import RobotFaulted
+from drivers.can.arm import Power
+from drivers.can.reactions import RULES, Fault, Reaction
+
+ARMS = ("openarm", "panda")
+SPEED = 0.8  # rad/s of every joint
+SICK = 2  # the axis that has the fault, counted from 0
+STRAIGHT = 0.04  # rad that a healthy axis may leave its way
+AT_REST = 0.02  # rad/s
+
+
+@dataclass
+class Row:
+    fault: Fault
+    strike: Callable[[Rig], None]
+    cycles: int  # at most until it is seen
+    arms: tuple[str, ...] = ARMS
+    only_moving: bool = False  # an arm that stands still does not show it
+    sick: tuple[int, ...] = (SICK,)  # axes that nobody can command any more, or whose pose is a lie
+
+
+def once(name: str, value: float = 1.0, axis: int = SICK + 1) -> Callable[[Rig], None]:
+    return lambda rig: rig.strike(name, axis, value)
+
+
+ROWS = {
+    "stale": Row(Fault.STALE, once("silence"), 4),
+    "lost": Row(Fault.LOST, once("power_cut"), 8),
+    "passive": Row(Fault.BUS_PASSIVE, once("corrupt", 17), 2, sick=()),
+    "bus off": Row(Fault.BUS_OFF, once("corrupt", 40), 2, sick=()),
+    "unplugged": Row(Fault.NO_ACKNOWLEDGE, once("unplug"), 2, sick=()),
+    "gone": Row(Fault.INTERFACE_GONE, lambda rig: setattr(rig.line, "gone", True), 2, sick=()),
+    "backlog": Row(Fault.BACKLOG, lambda rig: setattr(rig.line, "full", 3), 2, sick=()),
+    "drive fault": Row(Fault.AXIS_FAULT, once("trip"), 2),
+    "disabled": Row(Fault.DISABLED, once("disable"), 2),
+    "safe torque off": Row(Fault.NO_VOLTAGE, once("safe_torque_off", axis=0), 2, sick=tuple(range(7))),
+    "encoder": Row(Fault.ENCODER, once("encoder", 0.2), 2),
+    "blocked": Row(Fault.FOLLOWING, once("block"), 60, only_moving=True),
+    "heartbeat": Row(Fault.HEARTBEAT, once("heartbeat"), 52, sick=(), arms=("panda",)),
+    "hot": Row(Fault.HOT, once("hot", 96.0), 2, sick=(), arms=("openarm",)),
+    "flood": Row(Fault.FLOOD, once("babble", 0x55), 16, sick=()),
+    "overrun": Row(Fault.OVERRUN, lambda rig: rig.run(20_000_000), 2, sick=()),
+}
+
+
+@pytest.fixture(scope="module")
+def enabled() -> dict[str, Rig]:
+    """Rigs that hold their arm; tests take copies."""
+    made = {}
+    for arm in ARMS:
+        rig = Rig(arm, watchdog_ms=40.0)
+        m = rig.line.mechanics
+        m.load = 3.0 * m.inertia / m.inertia[0]
+        rig.driver.dynamics = lambda q, dq, ddq, m=m: vector(m.load + m.friction * dq + m.inertia * ddq)
+        rig.line.on_stand = True
+        rig.driver.configure()
+        rig.driver.activate(rig.period_ns)
+        made[arm] = rig
+    return made
+
+
+def run_up(rig: Rig, speed: float) -> Callable[[], Vector]:
+    """Bring the arm to that speed; what to command next."""
+    q0 = rig.driver.read(rig.now_ns()).q.copy()
+    t = [0.0]
+
+    def wanted() -> Vector:
+        t[0] += rig.period_ns * 1e-9
+        return vector(q0 + speed * (t[0] ** 2 / 0.2 if t[0] < 0.1 else t[0] - 0.05))
+
+    for _ in range(50):
+        sample = step(rig, wanted(), speed)
+        assert sample is not None and RobotFlag.READY in sample.flags
+    return wanted
+
+
+def step(rig: Rig, q: Vector, speed: float) -> object:
+    command = position(q, np.full(len(q), speed))
+    tau = rig.driver.dynamics(q, command.dq, np.zeros(len(q)))
+    return rig.cycle(dataclasses.replace(command, tau=tau))
+
+
+def strike_and_stop(rig: Rig, row: Row, speed: float) -> tuple[int, int, np.ndarray]:
+    """(cycles until the arm is stopped, until the row's fault was seen, true way of every joint from the strike on)."""
+    wanted = run_up(rig, speed)
+    way: list[np.ndarray] = []
+    tick = rig.line.tick
+    rig.line.tick = lambda t_ns: (tick(t_ns), way.append(rig.line.mechanics.q.copy()))[0]
+    struck = rig.driver._stream.seq
+    row.strike(rig)
+    for _ in range(row.cycles + 4):
+        try:
+            sample = step(rig, wanted(), speed)
+        except RobotFaulted:
+            break
+        if sample is not None and RobotFlag.FAULTED in sample.flags:
+            break
+    stopped = rig.driver._stream.seq - struck
+    rig.driver.stop()
+    rig.run(1_000_000_000 if RULES[row.fault].reaction is Reaction.CUT else 200_000_000)
+    seen = [found.seq for found in rig.driver._stream.found if found.fault is row.fault]
+    assert seen, f"{row.fault} was not seen: {[str(f) for f in rig.driver._stream.found]}"
+    return stopped, seen[0] - struck, np.array(way)
+
+
+@pytest.mark.parametrize("speed", [0.0, SPEED], ids=["at rest", "at speed"])
+@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_fault_stops_the_arm_and_lets_nothing_fall(
+    enabled: dict[str, Rig], arm: str, name: str, speed: float
+) -> None:
+    row = ROWS[name]
+    if arm not in row.arms or (row.only_moving and not speed):
+        pytest.skip("this drive, or an arm at rest, does not show it")
+    rig = copy.deepcopy(enabled[arm])
+    stopped, seen, way = strike_and_stop(rig, row, speed)
+    assert seen <= row.cycles and stopped <= row.cycles + 1
+    assert rig.driver.fault is not None and rig.driver.fault.hint
+    healthy = [i for i in range(len(rig.line.drives)) if i not in row.sick]
+    dq, q = rig.line.mechanics.dq[healthy], way[:, healthy]
+    assert np.all(np.abs(dq) < AT_REST), "the healthy axes are at rest"
+    if healthy:
+        off = straightness(q, np.full(len(healthy), speed))
+        limit = STRAIGHT * (2 if RULES[row.fault].reaction is Reaction.CUT else 1)  # each drive stops by itself
+        assert off < limit, f"{off * 1e3:.1f} mrad off the way"
+        assert np.all(np.abs(q[-1] - q[-100]) < 0.01), "and hold"
+    if RULES[row.fault].reaction is Reaction.STOP and row.fault is not Fault.NO_VOLTAGE:
+        powers = [drive.is_enabled or drive.brake_closed for drive in rig.line.drives]
+        assert all(powers[i] for i in healthy), "no axis without brake was let go"
+
+
+def straightness(q: np.ndarray, direction: np.ndarray) -> float:
+    """Farthest distance from the straight way that began at q[0], rad."""
+    gone = q - q[0]
+    if not direction.any():
+        return float(np.abs(gone).max())
+    along = gone @ direction / (direction @ direction)
+    return float(np.abs(gone - along[:, None] * direction).max())
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_one_lost_answer_is_bridged(enabled: dict[str, Rig], arm: str) -> None:
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, SPEED)
+    for _ in range(4):  # past the heartbeat: the next frame of the axis is its answer
+        step(rig, wanted(), SPEED)
+    rig.strike("lose", SICK + 1, 1)
+    sample = step(rig, wanted(), SPEED)
+    assert sample is not None and RobotFlag.READY in sample.flags
+    assert rig.driver._stream.counters.missed == 1 and rig.driver._stream.missed[SICK] == 1
+    assert sample.q[SICK] == pytest.approx(rig.line.mechanics.q[SICK], abs=0.006)
+    assert step(rig, wanted(), SPEED) is not None and rig.driver._stream.missed[SICK] == 0
+
+
+@pytest.mark.parametrize(("name", "value", "fault"), [("hot", 75.0, Fault.WARM), ("late", 3.0, Fault.MISSED)])
+def test_what_is_only_a_warning_moves_on(enabled: dict[str, Rig], name: str, value: float, fault: Fault) -> None:
+    rig = copy.deepcopy(enabled["openarm"])
+    wanted = run_up(rig, SPEED)
+    if name == "late":
+        rig.line.late[SICK] = 0
+        rig.strike("lose", SICK + 1, 2)
+    else:
+        rig.strike(name, SICK + 1, value)
+    for _ in range(10):
+        sample = step(rig, wanted(), SPEED)
+        assert sample is not None and RobotFlag.READY in sample.flags
+    assert rig.driver.report()["found"][fault] > 0
+
+
+def test_nothing_is_enabled_or_reset_by_itself(enabled: dict[str, Rig]) -> None:
+    rig = copy.deepcopy(enabled["openarm"])
+    run_up(rig, 0.0)
+    rig.strike("disable", SICK + 1)
+    special: list[bytes] = []
+    rig.line.listeners.append(lambda d: special.append(d.frame.data) if d.frame.data[:7] == b"\xff" * 7 else None)
+    rig.driver.read(rig.now_ns())
+    rig.driver.stop()
+    assert not special and rig.driver._stream.powers()[SICK] is Power.DISABLED
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_velocity_is_followed(enabled: dict[str, Rig], arm: str) -> None:
+    rig = copy.deepcopy(enabled[arm])
+    run_up(rig, 0.0)
+    q = rig.driver.read(rig.now_ns()).q
+    for _ in range(60):
+        dq = np.full(7, 0.3)
+        tau = rig.driver.dynamics(q, dq, np.zeros(7))
+        sample = rig.cycle(JointCommand(0, CommandKind.VELOCITY, vector(q), vector(dq), tau, False))
+        assert sample is not None and RobotFlag.READY in sample.flags
+    np.testing.assert_allclose(rig.line.mechanics.dq, 0.3, atol=0.03)

@@ -1,0 +1,179 @@
+"""From images to capsules: what is seen is covered, the unseen is occupied, the robot and an empty cell are nobody."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asc_rt.perception import kernels
+from asc_rt.perception.arm import EXTRAPOLATION_NS, JointHistory
+from asc_rt.perception.grid import Grid, View, without_specks
+from asc_rt.perception.parts import PARTS, Tracker, capsule
+from asc_rt.perception.volume import REACH_SPEED, Volume
+from calibration.geometry import look_at
+from drivers.cameras.base import Intrinsics
+from sim_hil import seeing
+
+NOWHERE = np.zeros((1, 3)), np.zeros((1, 3)), np.array([-9.0])  # an arm that is not there
+STEP_NS = 66_000_000
+LENS = Intrinsics(80, 60, 60.0, 60.0, 39.5, 29.5)
+WALL = np.full((60, 80), 4000, np.uint16)
+
+
+def one_camera() -> Volume:
+    """It looks along +x at a wall 4 m away."""
+    grid = Grid.over(np.array([1.0, -0.6, -0.4]), np.array([3.0, 0.6, 0.4]), 0.05)
+    return Volume(grid, [View(LENS, 0.001, look_at((0, 0, 0), (1, 0, 0)), WALL, grid)])
+
+
+def with_board(distance_mm: int) -> np.ndarray:
+    """Something 0.5 m wide and high in the middle of the picture."""
+    depth = WALL.copy()
+    half = round(60.0 * 250 / distance_mm)
+    depth[30 - half : 30 + half, 40 - half : 40 + half] = distance_mm
+    return depth
+
+
+# --- the volume ------------------------------------------------------------------------------------------------------
+
+
+def test_nobody_is_in_an_empty_volume_and_what_is_behind_a_surface_is_occupied() -> None:
+    volume = one_camera()
+    assert volume.coverage([True]) > 0.9 and volume.coverage([False]) == 0.0
+    assert not len(volume.update(0, [WALL], NOWHERE))
+    for k in range(1, 9):
+        told = volume.update(k * STEP_NS, [with_board(2000)], NOWHERE)
+    assert abs(told[:, 0].min() - 2.0) < 0.08, "nothing is claimed before the surface"
+    behind = told[(np.abs(told[:, 1]) < 0.2) & (np.abs(told[:, 2]) < 0.2)]
+    assert behind[:, 0].max() > 2.8, "the shadow is occupied"
+
+
+def test_what_was_hidden_stays_until_it_is_seen_free() -> None:
+    volume = one_camera()
+    volume.update(0, [WALL], NOWHERE)
+    for k in range(1, 5):
+        told = volume.update(k * STEP_NS, [with_board(2000)], NOWHERE)
+    blind = [volume.update(k * STEP_NS, [None], NOWHERE) for k in range(5, 7)]
+    grown = told[:, 0].min() - blind[-1][:, 0].min()
+    assert grown >= 2 * REACH_SPEED * STEP_NS * 1e-9 - 0.05, "blind, they may have come nearer at 2 m/s"
+    assert len(blind[1]) > len(blind[0]) > len(told)
+    assert not len(volume.update(7 * STEP_NS, [WALL], NOWHERE))
+
+
+def test_a_blind_camera_frees_nothing() -> None:
+    volume = one_camera()
+    assert len(volume.update(0, [None], NOWHERE)) == np.count_nonzero(volume.guarded)
+    assert len(volume.update(STEP_NS, [np.zeros_like(WALL)], NOWHERE)) == np.count_nonzero(volume.guarded)
+
+
+def test_a_lone_missing_pixel_is_filled_with_the_nearest_and_two_are_not() -> None:
+    depth = WALL.copy()
+    depth[10, 10], depth[9, 9] = 0, 1500
+    depth[30, 30] = depth[30, 31] = 0
+    filled = without_specks(depth)
+    assert filled[10, 10] == 1500
+    assert filled[30, 30] == filled[30, 31] == 0
+
+
+def test_components_join_over_corners() -> None:
+    block = np.zeros((4, 4, 4), np.uint8)
+    block[0, 0, 0] = block[1, 1, 1] = block[3, 3, 3] = 1
+    found, label = kernels.components(block.ravel(), block.shape)
+    assert label[0] == label[1] != label[2]
+    assert len(found) == 3
+
+
+# --- capsules and tracks ---------------------------------------------------------------------------------------------
+
+points = st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=60).map(lambda rows: np.array(rows, float))
+
+
+def outside(p: np.ndarray, p0: np.ndarray, p1: np.ndarray, radius: np.ndarray) -> float:
+    return float(kernels.distances(p, np.atleast_2d(p0), np.atleast_2d(p1), np.atleast_1d(radius)).max())
+
+
+@settings(max_examples=60, deadline=None)
+@given(points)
+def test_a_capsule_covers_all_its_points(cloud: np.ndarray) -> None:
+    p0, p1, radius = capsule(cloud)
+    assert outside(cloud, p0, p1, np.array(radius)) <= 1e-6
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(points, min_size=1, max_size=4))
+def test_the_parts_cover_every_point_whatever_came_before(clouds: list[np.ndarray]) -> None:
+    tracker = Tracker()
+    for k, cloud in enumerate(clouds):
+        parts = tracker.update(k * STEP_NS, cloud, np.ones(len(cloud)))
+        assert 0 < len(parts.radius) <= PARTS
+        for point in cloud:
+            assert kernels.to_capsules(*point, parts.p0, parts.p1, parts.radius) <= 1e-6
+
+
+def test_a_steady_motion_is_known_within_its_bound_and_a_jump_begins_anew() -> None:
+    tracker, rng = Tracker(1), np.random.default_rng(1)
+    cloud = rng.uniform(-0.1, 0.1, (200, 3))
+    velocity = np.array([1.2, -0.5, 0.0])
+    for k in range(20):
+        parts = tracker.update(k * STEP_NS, cloud + k * STEP_NS * 1e-9 * velocity, np.ones(200))
+    assert np.linalg.norm(parts.velocity[0] - velocity) < 0.1
+    assert parts.velocity_bound[0] < REACH_SPEED + np.linalg.norm(velocity)
+    jumped = tracker.update(20 * STEP_NS, cloud + 5.0, np.ones(200))
+    assert np.linalg.norm(jumped.velocity[0]) == 0.0
+    assert jumped.velocity_bound[0] == pytest.approx(REACH_SPEED)
+    assert not len(tracker.update(21 * STEP_NS, np.zeros((0, 3)), np.zeros(0)).radius)
+
+
+# --- joints at the moment of capture ---------------------------------------------------------------------------------
+
+
+def test_joints_are_those_of_the_capture_or_none() -> None:
+    history = JointHistory()
+    assert history.at(0) is None
+    for k in range(5):
+        history.add(k * 8_000_000, np.array([0.1 * k, -0.2 * k]))
+    history.add(1, np.array([9.0, 9.0]))  # late: of no use
+    assert history.at(12_000_000) == pytest.approx([0.15, -0.3])
+    assert history.at(40_000_000) == pytest.approx([0.5, -1.0]), "carried on"
+    assert history.at(32_000_000 + EXTRAPOLATION_NS + 1) is None
+    assert history.at(-1) is None
+
+
+# --- the whole, judged by the truth ----------------------------------------------------------------------------------
+
+
+def test_no_distance_is_overestimated_and_an_empty_cell_is_empty() -> None:
+    """The short version of `python -m sim_hil seeing -n 200`."""
+    looks = [look for seed in (7, 11) for look in seeing.episode(seed, 2.5)]
+    result = seeing.table(looks, [])
+    assert result["judged"] > 20
+    assert result["over_bound"] == 0 and result["over_later"] == 0
+    assert result["median_under_m"] < 0.2
+
+
+def test_the_robot_at_work_is_nobody() -> None:
+    looks = seeing.episode(5, 2.0, people=False)
+    assert sum(look.told < seeing.NEAR for look in looks) == 0
+
+
+# --- does the camera stand where it stood ----------------------------------------------------------------------------
+
+
+def test_a_camera_that_has_moved_a_little_is_found_and_one_that_has_not_is_left_alone() -> None:
+    """The corner of a room, and somebody in it; true displacements of the farthest corner of the volume."""
+    from asc_rt.perception.stance import LIMIT, Stance
+
+    s = seeing.studio()
+    eye, view, person = s.eyes[0], s.views[0], seeing.Roamer(3)
+    for moved, low, high in [(0.0, 0.0, LIMIT / 2), (0.03, 0.02, 0.04), (0.08, 0.06, 0.1)]:
+        stance, T = Stance(view, s.grid.corners()), np.eye(4)
+        T[0, 3] = moved
+        eye.move(T)
+        for k in range(20):
+            s.scene.set_person(person.at(2.0 + 0.1 * k))
+            shift = stance.shift(eye.sense())
+        assert shift is not None and low <= shift <= high
+    eye.move(np.eye(4))
+    assert Stance(view, s.grid.corners()).shift(np.zeros_like(view.background)) is None
