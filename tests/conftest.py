@@ -29,6 +29,15 @@ for cell in ("fanuc-sim", "panda-torque-sim"):  # one of each control level
 """
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests marked `real_time` are repeated, twice at most: the report counts them as reruns. A virtual machine stands
+    still for up to 79 ms (MEASURED, by a SCHED_FIFO process that only sleeps); a session in it rightly ends then, and
+    proves nothing of what was to be seen. What is wrong by itself fails three times."""
+    for item in items:
+        if item.get_closest_marker("real_time"):
+            item.add_marker(pytest.mark.flaky(reruns=2))
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """A minute of compiling, once: in a test it would count against that test's time limit, and both workers of a
     fresh tree would compile the same kernels at once."""

@@ -18,6 +18,8 @@ from asc_rt import bus_keys, clock_sync, topics
 from asc_rt.bus import Bus, BusError, Keys, Latest, Remote, open_client, open_router
 from asc_rt.human_codec import clock_id
 
+pytestmark = pytest.mark.real_time
+
 HERE, THERE = "10.213.7.1", "10.213.7.2"
 AHEAD_S = 5_000  # of the other machine's clock
 SENSOR = "side"

@@ -31,6 +31,8 @@ from sim_hil.fanuc.rmi_sockets import RmiSockets
 from sim_hil.fanuc.server import serve
 from sim_hil.fanuc.settings import Settings
 
+pytestmark = pytest.mark.real_time
+
 T = 0.008
 HOME = [30.0, 20.0, -10.0, 40.0, -50.0, 60.0]  # URDF; on the classic wire J3 is -30
 PENDANT_HOME = [30.0, 20.0, -30.0, 40.0, -50.0, 60.0]

@@ -255,6 +255,7 @@ def test_one_file_needs_no_manifest(make: Callable[..., Bench]) -> None:
 # --- the process -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("policy", ["stop", "finish"])
 def test_the_policy_decides_whether_the_logger_stays(recording: Any, tmp_path: Path, policy: str) -> None:
     """A limit on the size of files is a full disk that needs no disk."""

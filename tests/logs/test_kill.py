@@ -74,6 +74,7 @@ class Session:
 VICTIMS = ("controller", "logger", "both")
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("trial", [*range(5), *(pytest.param(k, marks=pytest.mark.slow) for k in range(5, 100))])
 def test_no_complete_cycle_is_lost(
     recording: Any, tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch, trial: int

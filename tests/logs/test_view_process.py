@@ -25,6 +25,7 @@ def listeners(port: int) -> list[str]:
     ]
 
 
+@pytest.mark.real_time
 def test_the_viewer_keeps_to_this_machine_and_reports_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     ports = [free_port(), free_port()]

@@ -170,6 +170,7 @@ def wait_until(condition: Any) -> None:
     raise AssertionError("it did not happen")
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("ending", ["closed", "terminated"])
 def test_the_process_records_a_session(recording: Any, session_ring: Path, tmp_path: Path, ending: str) -> None:
     packed, out, endpoint = recording.packed(recording.cycles(40)), tmp_path / "a.mcap", free_endpoint()

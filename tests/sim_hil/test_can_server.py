@@ -30,7 +30,7 @@ from sim_hil.can.server import Server
 
 ROOT = Path(__file__).parents[2]
 MOVER = ROOT / "tests" / "drivers" / "can_mover.py"
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.real_time
 
 
 @contextmanager

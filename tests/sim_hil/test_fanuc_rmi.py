@@ -111,6 +111,7 @@ def robot(tmp_path: Path) -> Iterator[tuple[int, int, subprocess.Popen[str]]]:
     process.communicate()
 
 
+@pytest.mark.real_time
 def test_a_session_over_udp_and_tcp(robot: tuple[int, int, subprocess.Popen[str]], tmp_path: Path) -> None:
     udp, tcp, process = robot
     options = {"host": "127.0.0.1", "port": udp, "rmi_port": tcp, "settle": 0.1, "limits": True, "arm": "crx_10ia_l"}

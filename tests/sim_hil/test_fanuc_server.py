@@ -18,6 +18,8 @@ from asc_rt.config import CELLS
 from drivers.fanuc_stream_motion.link import StreamMotion
 from sim_hil.fanuc import wire
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.fixture
 def port() -> int:

@@ -134,6 +134,7 @@ def test_rhythm_skips_and_never_bursts(period: int, waits: list[int]) -> None:
     assert taken == sorted(set(taken))
 
 
+@pytest.mark.real_time
 def test_the_process_publishes_until_it_is_told_to_stop(router: Bus, endpoint: str) -> None:
     sensed, truth, ready = (router.latest(t.key) for t in (topics.HUMAN, topics.PERSON_TRUTH, topics.ready("human")))
     stop: list[int] = []
@@ -153,6 +154,7 @@ def test_the_process_publishes_until_it_is_told_to_stop(router: Bus, endpoint: s
     assert exact is not None and len(exact[1].labels) == 10
 
 
+@pytest.mark.real_time
 def test_the_command_says_ready_and_ends_on_sigterm(router: Bus, endpoint: str) -> None:
     command = [sys.executable, "-m", "sim_hil", "human", "fanuc-sim", "--set", f"bus.endpoint={endpoint}"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
