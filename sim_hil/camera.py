@@ -2,9 +2,9 @@
 
     python -m sim_hil camera CELL
 
-`sim/truth` and `sim/person` say where; each camera is a depth stream (depth_camera.py) on the port that the cell's own
-[perception.camera.NAME.device] names. Their true poses are in [sim.camera.NAME]: what the cell believes of them is its
-calibration's affair.
+`sim/truth` and `sim/person` say where; each camera is a depth stream (depth_camera.py) where the cell's own
+[perception.camera.NAME.device] looks for it. Their true poses are in [sim.camera.NAME]: what the cell believes of them
+is its calibration's affair.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class Mount:
     name: str
     serial: str
     T_base_cam: Array  # (4, 4), the truth
+    host: str
     port: int
 
 
@@ -63,14 +64,14 @@ class Settings:
     def of(cls, cell: Cell) -> Settings:
         """ValueError: one line per fault."""
         table = dict(cell.sim.get("camera", {}))
-        ports = (
-            {camera.name: camera.device.get("port", 0) for camera in cell.perception.cameras} if cell.perception else {}
-        )
+        devices = {camera.name: camera.device for camera in cell.perception.cameras} if cell.perception else {}
         faults, mounts = [], []
         for name, entry in [(k, v) for k, v in table.items() if isinstance(v, dict)]:
             del table[name]
             try:
-                mounts.append(Mount(name, entry["serial"], true_pose(entry), ports[name]))
+                device = devices[name]
+                host, port = device.get("host", "127.0.0.1"), device.get("port", 0)
+                mounts.append(Mount(name, entry["serial"], true_pose(entry), host, port))
             except (KeyError, TypeError, ValueError) as error:
                 faults.append(
                     f"sim.camera.{name}: {error}; serial, at and target or pose (4 x 4); a name of [perception.camera]"
@@ -150,7 +151,9 @@ def serve(cell: Cell, settings: Settings, bus: Bus, script: Sequence[Fault], sto
         m.name: Eye(stage.scene, m.T_base_cam, settings.optics, settings.seed + i)
         for i, m in enumerate(settings.mounts)
     }
-    servers = {m.name: StreamServer(m.port, settings.optics, m.serial, period_ns, latency_ns) for m in settings.mounts}
+    servers = {
+        m.name: StreamServer(m.host, m.port, settings.optics, m.serial, period_ns, latency_ns) for m in settings.mounts
+    }
     ready = bus.publisher(topics.ready("camera").key)
     try:
         for server in servers.values():

@@ -30,6 +30,7 @@ class Faults:
 class StreamServer:
     """One client; a frame nobody takes is dropped, as a camera does."""
 
+    host: str  # where clients find it
     port: int
     optics: Optics
     serial: str
@@ -43,7 +44,7 @@ class StreamServer:
 
     def open(self) -> int:
         """Listen; the port (chosen by the system if it was 0)."""
-        self._listener = socket.create_server(("127.0.0.1", self.port))
+        self._listener = socket.create_server((self.host, self.port))
         self._listener.setblocking(False)
         return int(self._listener.getsockname()[1])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -17,10 +16,11 @@ import pytest
 from asc_rt import bus_keys, clock_sync, topics
 from asc_rt.bus import Bus, BusError, Keys, Latest, Remote, open_client, open_router
 from asc_rt.human_codec import clock_id
+from tests import other_machine as other
+from tests.other_machine import HERE
 
 pytestmark = pytest.mark.real_time
 
-HERE, THERE = "10.213.7.1", "10.213.7.2"
 AHEAD_S = 5_000  # of the other machine's clock
 SENSOR = "side"
 
@@ -40,31 +40,10 @@ def heard(box: Latest, seconds: float = 5.0) -> bytes | None:
     return None
 
 
-def ip(*words: str) -> bool:
-    return subprocess.run(["ip", *words], capture_output=True).returncode == 0
-
-
 @pytest.fixture(scope="module")
 def other_machine() -> Iterator[str]:
-    """The name of a network namespace that reaches us at HERE."""
-    name = f"asc{os.getpid()}"
-    if os.geteuid() != 0:
-        pytest.skip("needs root to make a network namespace")
-    if not ip("netns", "add", name):
-        pytest.skip("network namespaces cannot be made here")
-    try:
-        made = (
-            ip("link", "add", f"{name}a", "type", "veth", "peer", "name", f"{name}b", "netns", name)
-            and ip("addr", "add", f"{HERE}/30", "dev", f"{name}a")
-            and ip("link", "set", f"{name}a", "up")
-            and ip("-n", name, "addr", "add", f"{THERE}/30", "dev", f"{name}b")
-            and ip("-n", name, "link", "set", f"{name}b", "up")
-        )
-        if not made:
-            pytest.skip("a link between two network namespaces cannot be made here")
+    with other.made() as name:
         yield name
-    finally:
-        ip("netns", "del", name)
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +95,8 @@ def there(
     machine: str, endpoint: str, keys: Path, name: str, *says: str, timeout: float = 5.0, ahead_s: int = 0
 ) -> subprocess.Popen[str]:
     """A process of another machine that says the same at each key; its clock is ahead of ours."""
-    clock = ["unshare", "--time", "--monotonic", str(ahead_s), "--fork"] if ahead_s else []
-    command = [*clock, sys.executable, "-c", PEER, endpoint, str(keys), name, str(timeout), *says]
-    return subprocess.Popen(["ip", "netns", "exec", machine, *command], stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-c", PEER, endpoint, str(keys), name, str(timeout), *says]
+    return subprocess.Popen([*other.there(machine, ahead_s), *command], stdout=subprocess.PIPE, text=True)
 
 
 def told(process: subprocess.Popen[str]) -> dict[str, object]:

@@ -46,7 +46,7 @@ class Rig:
 
 
 def stream_rig(tmp_path: Path) -> Iterator[Rig]:
-    server = StreamServer(0, OPTICS, "S1", PERIOD_NS)
+    server = StreamServer("127.0.0.1", 0, OPTICS, "S1", PERIOD_NS)
     camera = DepthStream({"port": server.open()})
 
     def greet() -> CameraInfo:
