@@ -3,6 +3,10 @@ possible.
 
 The set-points are jerk-limited: over one period T the acceleration goes linearly from the commanded one to u, so
     q+ = q + T dq + T^2 (2 ddq + u) / 6,   dq+ = dq + T (ddq + u) / 2.
+A torque acts at once: from the beginning of the period on the acceleration is u, and u takes the place of ddq in both.
+(Who counts half of the last acceleration a into the speed of an arm that has forgotten it finds 2 v / T + a too much,
+asks for it to be taken away, and so on: v+ = -v - T a, a+ = -2 v / T - a grows by 1 + sqrt 2 a period. A Panda before a
+person shook so with +-8 rad/s2.)
 u is allowed if the state (q+, dq+, u) can still be brought to rest inside the position limits and never exceeds the
 velocity limit on the way. Naive bounds ((dq_max - dq) / T and the like) become infeasible near a limit.
 """
@@ -32,7 +36,7 @@ class Bounds(NamedTuple):
 
 
 @njit(cache=True)
-def _greatest(room: float, dq: float, ddq: float, dq_max: float, A: float, J: float, T: float) -> float:
+def _greatest(room: float, dq: float, ddq: float, dq_max: float, A: float, J: float, T: float, at_once: bool) -> float:
     """Greatest allowed u of one joint whose position limit is `room` ahead, within the jerk and acceleration limits.
 
     If none is allowed (a limit moved, or noise), the hardest braking the jerk permits: the nearest way back.
@@ -40,13 +44,13 @@ def _greatest(room: float, dq: float, ddq: float, dq_max: float, A: float, J: fl
     low, high = max(-A, ddq - J * T), min(A, ddq + J * T)
     if high < low:
         return low
-    if _fits(high, room, dq, ddq, dq_max, A, J, T):
+    if _fits(high, room, dq, ddq, dq_max, A, J, T, at_once):
         return high
-    if not _fits(low, room, dq, ddq, dq_max, A, J, T):
+    if not _fits(low, room, dq, ddq, dq_max, A, J, T, at_once):
         return low
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        if _fits(middle, room, dq, ddq, dq_max, A, J, T):
+        if _fits(middle, room, dq, ddq, dq_max, A, J, T, at_once):
             low = middle
         else:
             high = middle
@@ -63,9 +67,11 @@ def _fits(
     A: float,
     J: float,
     T: float,
+    at_once: bool,
 ) -> bool:
-    advance = T * dq + T * T * (2.0 * ddq + u) / 6.0
-    speed = dq + T * (ddq + u) / 2.0
+    begin = u if at_once else ddq
+    advance = T * dq + T * T * (2.0 * begin + u) / 6.0
+    speed = dq + T * (begin + u) / 2.0
     peak = speed + u * u / (2.0 * J) if u > 0.0 else speed
     return peak <= dq_max and advance + stopping_distance(speed, u, A, J) <= room
 
@@ -81,15 +87,17 @@ def reserve(dq_max: float, A: float, J: float, T: float) -> float:
 
 
 @njit(cache=True)
-def command_box(bounds: Bounds, q: Vector, dq: Vector, ddq: Vector, T: float) -> tuple[Vector, Vector]:
+def command_box(
+    bounds: Bounds, q: Vector, dq: Vector, ddq: Vector, T: float, at_once: bool = False
+) -> tuple[Vector, Vector]:
     """Bounds lower <= u <= upper on the next commanded acceleration, rad/s2: position, velocity, acceleration, jerk."""
     n = q.shape[0]
     lower, upper = np.empty(n), np.empty(n)
     for i in range(n):
         A, J, v = bounds.ddq_max[i], bounds.dddq_max[i], bounds.dq_max[i]
         free = reserve(v, A, J, T)
-        upper[i] = _greatest(bounds.q_max[i] - free - q[i], dq[i], ddq[i], v, A, J, T)
-        lower[i] = -_greatest(q[i] - free - bounds.q_min[i], -dq[i], -ddq[i], v, A, J, T)
+        upper[i] = _greatest(bounds.q_max[i] - free - q[i], dq[i], ddq[i], v, A, J, T, at_once)
+        lower[i] = -_greatest(q[i] - free - bounds.q_min[i], -dq[i], -ddq[i], v, A, J, T, at_once)
         if lower[i] > upper[i]:  # both sides call for braking: take the one that is being approached
             if dq[i] > 0.0:
                 lower[i] = upper[i]

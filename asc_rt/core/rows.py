@@ -117,7 +117,7 @@ def _rows(
     then = carried(people, horizon)
     motion = forward(arm.chain, q, dq)
     pairs = nearest_first(separation_at(motion, arm.capsules, then, reach, human_acceleration))
-    lower, upper = command_box(b, q, dq, ddq, T)
+    lower, upper = command_box(b, q, dq, ddq, T, index.at_once)
     U = with_torque(arm, motion, lower, upper)
     brake_time = np.max(np.abs(dq) / b.ddq_max + b.ddq_max / b.dddq_max)
     free = free_pairs(pairs, ddq, b.dddq_max, lower, upper, T, index, brake_time)

@@ -88,18 +88,19 @@ class Index(NamedTuple):
     eta: float  # 1/s
     M_floor: float  # m/s2
     v_max: float  # m/s
+    at_once: bool = False  # the control acts from the beginning of a period, as a torque does: see `limits`
 
 
-def index_of(safety: SafetyParams) -> Index:
+def index_of(safety: SafetyParams, at_once: bool = False) -> Index:
     kind = {"phi-star": PHI_STAR, "phi-b": PHI_B}[safety.index]
-    return Index(kind, safety.d_min, safety.k, safety.brake, safety.eta, safety.M_floor, safety.v_max)
+    return Index(kind, safety.d_min, safety.k, safety.brake, safety.eta, safety.M_floor, safety.v_max, at_once)
 
 
 @njit(cache=True)
 def unpack(packed: Vector) -> Index:
     """An Index from its numbers in one array, which is how Python hands it to a kernel fastest."""
     x = packed
-    return Index(int(x[0]), x[1], x[2], x[3], x[4], x[5], x[6])
+    return Index(int(x[0]), x[1], x[2], x[3], x[4], x[5], x[6], x[7] > 0.0)
 
 
 @njit(cache=True)
@@ -182,10 +183,11 @@ def psi(d: float, v: float, a: float, M: float, M_dot: float, J: float, index: I
 def _psi_after(
     u: float, d: float, v: float, a: float, T: float, M: float, M_dot: float, J: float, index: Index
 ) -> float:
-    """psi one period later if the approach acceleration goes from a to u."""
-    ahead = d - T * v - T * T * (2.0 * a + u) / 6.0
+    """psi one period later if the approach acceleration goes from a to u, or is u at once."""
+    begin = u if index.at_once else a
+    ahead = d - T * v - T * T * (2.0 * begin + u) / 6.0
     fall = T * min(0.0, M_dot) if index.kind == PHI_STAR else 0.0
-    return psi(ahead, v + T * (a + u) / 2.0, u, M + fall, M_dot, J, index)
+    return psi(ahead, v + T * (begin + u) / 2.0, u, M + fall, M_dot, J, index)
 
 
 @njit(cache=True)
@@ -227,11 +229,14 @@ def greatest_approach(
 
 
 @njit(cache=True)
-def approach_ending(v: float, a: float, T: float, J: float) -> float:
+def approach_ending(v: float, a: float, T: float, J: float, at_once: bool = False) -> float:
     """Greatest approach acceleration u with which the approach is over once u has been ramped away, m/s2.
 
-    Speed after the period and the ramp: v + T (a + u) / 2 + u |u| / (2 J) = 0, solved for u.
+    Speed after the period and the ramp: v + T (a + u) / 2 + u |u| / (2 J) = 0, solved for u; where u acts at once,
+    v + T u + u |u| / (2 J) = 0.
     """
+    if at_once:
+        a, T = 0.0, 2.0 * T
     s = v + T * a / 2.0
     half = J * T / 2.0
     if s <= 0.0:
@@ -344,7 +349,7 @@ def row_floors(
             continue
         near = _is_near(d, v, v_robot, index, brake_time)
         creep = min(STANDSTILL_SPEED, max(STANDSTILL_LEAST, STANDSTILL_FADE * (d - index.d_min)))
-        own = -approach_ending(v_robot - creep, -(e.along + pairs.drift_robot[i]), T, e.jerk)
+        own = -approach_ending(v_robot - creep, -(e.along + pairs.drift_robot[i]), T, e.jerk, index.at_once)
         standstill = own - pairs.drift_robot[i]
         if M[i] <= index.M_floor or e.jerk <= NO_JERK:
             basis[i], outside[i] = M_FLOOR, outside[i] + OUTSIDE_RADIUS

@@ -30,7 +30,7 @@ class System:
         r = first.robot
         self.model = robot_model.load(r, first.tool, params.control)
         self.bounds = self.model.arm.bounds
-        self.index = index_of(params.safety)
+        self.index = index_of(params.safety, at_once=params.control == "torque")
         self.packed_index = vector(self.index)
         self.zero = vector(np.zeros(params.n))
         self.planner = ruckig.Ruckig(self.n)

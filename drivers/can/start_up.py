@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
 from collections.abc import Iterator
 
 import numpy as np
@@ -15,6 +17,7 @@ from drivers.can.options import Options
 from drivers.can.stream import Stream, hold, look
 
 BUS = "robot"  # name of the line that says whether anybody is there
+LEAST_QUEUE, FD_MTU = 64, 72  # frames that the interface holds for us, two cycles' and more; bytes of one of CAN FD
 LISTENED = 16  # frames of others that are told by identifier
 REHEARSAL = 50  # cycles before anything is enabled
 LOSSES = 2  # answers of one axis that may be lost meanwhile
@@ -32,6 +35,7 @@ def examine(link: Link, codec: ArmCodec, options: Options, period_ns: int) -> It
         yield Finding(BUS, False, str(error), error.hint)
         return
     yield Finding(BUS, True, f"{options.interface} {options.channel} is open")
+    yield bit_timing(codec, options.interface, options.channel)
     yield _load(codec, period_ns)
     yield _silence(codec)
     yield _listen(link, options)
@@ -39,6 +43,44 @@ def examine(link: Link, codec: ArmCodec, options: Options, period_ns: int) -> It
     h = link.health
     wrong = [name for name in ("passive", "off", "unacknowledged", "backlog", "gone") if getattr(h, name)]
     yield Finding("bus state", not wrong, ", ".join(wrong) or "error active", "check termination, cabling and power")
+
+
+def bit_timing(codec: ArmCodec, interface: str, channel: str) -> Finding:
+    """SocketCAN takes its bit rates from `ip link`, whatever a program asks for."""
+    if interface != "socketcan":
+        return Finding("bit timing", True, f"{interface} does not tell; a wrong one shows in the scan")
+    try:
+        (link,) = json.loads(shown_by_ip(channel))
+    except ValueError:
+        return Finding("bit timing", False, f"no such interface: {channel}", f"ip link show {channel}")
+    told, wrong = link.get("linkinfo", {}), []
+    if "UP" not in link.get("flags", ()):
+        wrong.append("it is down")
+    if told.get("info_kind") != "vcan":  # which has no wire
+        data = told.get("info_data", {})
+        rate, data_rate = (data.get(key, {}).get("bitrate", 0) for key in ("bittiming", "data_bittiming"))
+        if rate != codec.bitrate:
+            wrong.append(f"{rate} bit/s, not {codec.bitrate:.0f}")
+        if codec.data_bitrate and data_rate != codec.data_bitrate:
+            wrong.append(f"{data_rate} bit/s in the data phase, not {codec.data_bitrate:.0f}")
+        if (queue := link.get("txqlen", 0)) < LEAST_QUEUE:
+            wrong.append(f"a queue of {queue} frames, at least {LEAST_QUEUE}")
+    if codec.data_bitrate and link.get("mtu", 0) < FD_MTU:
+        wrong.append("it carries no CAN FD")
+    fd = f" dbitrate {codec.data_bitrate:.0f} fd on" if codec.data_bitrate else ""
+    fix = f"ip link set {channel} down; ip link set {channel} txqueuelen {LEAST_QUEUE} up type can "
+    return Finding(
+        "bit timing", not wrong, ", ".join(wrong) or "as the arm needs it", f"{fix}bitrate {codec.bitrate:.0f}{fd}"
+    )
+
+
+def shown_by_ip(channel: str) -> str:
+    """What the kernel says of an interface; empty: there is none, or no `ip` to ask."""
+    try:
+        asked = ["ip", "-details", "-json", "link", "show", channel]
+        return subprocess.run(asked, capture_output=True, text=True, timeout=5.0, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
 
 
 def _load(codec: ArmCodec, period_ns: int) -> Finding:
@@ -87,7 +129,11 @@ def enable(stream: Stream, options: Options, dynamics: Dynamics) -> Iterator[Fin
 
 
 def _rehearse(stream: Stream) -> Finding:
-    """The cycle as it will be, without commanding anything: losses show here, not in motion."""
+    """The cycle as it will be, without commanding anything: losses show here, not in motion.
+
+    A loss is an answer that never comes. One that comes late is judged by its age, as in motion: who is told too late
+    to go on there does not begin.
+    """
     stream.pause()
     for _ in range(REHEARSAL):
         _cycle(stream, look(len(stream.axes)))
@@ -101,8 +147,9 @@ def _rehearse(stream: Stream) -> Finding:
     fix = "a person looks for the cause and resets the drive: nothing is reset by itself"
     _checked(Finding("power", not wrong, ", ".join(wrong) or "as it was left, and without fault", fix))
     lost = max(axis.lost for axis in stream.axes)
-    detail = f"{lost} of {REHEARSAL} answers of an axis lost"
-    return _checked(Finding("rehearsal", lost <= LOSSES, detail, "check cabling and the load of this PC"))
+    detail = "; ".join([f"{lost} of {REHEARSAL} answers of an axis lost", *map(str, stream.found)])
+    ok = lost <= LOSSES and not stream.found
+    return _checked(Finding("rehearsal", ok, detail, "check cabling and the load of this PC"))
 
 
 def _seed(stream: Stream) -> Vector:

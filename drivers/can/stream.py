@@ -61,6 +61,9 @@ class Stream:
         frames = self.codec.encode(self.seq + 1, targets, [axis.feedback for axis in self.axes])
         self.seq += 1
         now_ns = self._unique(self.link.now_ns())
+        if self.seq == 1:  # nothing was asked before: ages begin here
+            for axis in self.axes:
+                axis.t_rx_ns = now_ns
         self._note_lateness(now_ns)
         if self._tap is not None:
             self._tap("tx", now_ns, bundle(self.seq, frames))
@@ -132,8 +135,10 @@ class Stream:
 
     def _take(self, i: int, told: Feedback, frame: Frame, now_ns: int) -> None:
         axis, before = self.axes[i], replace(self.axes[i])
-        self.counters.late_answers += axis.seq == self.seq  # two in one cycle: the first was to an earlier one
-        elapsed = self._elapsed(axis, frame)
+        if axis.seq == self.seq:  # two in one cycle: the first was to an earlier one
+            self.counters.late_answers += 1
+            axis.lost = max(0, axis.lost - 1)
+        elapsed = self._elapsed(axis, frame, now_ns)
         whole = max(self.seq - axis.seq, 1) * self.period_ns * 1e-9  # a torque acts until the next one comes
         axis.take_speed(told, elapsed, (axis.gained - axis.gain) * elapsed / whole)
         axis.gained = axis.gain
@@ -145,12 +150,18 @@ class Stream:
         for found in self._watch.moved(i, before, axis, self.seq):
             self._note(found)
 
-    def _elapsed(self, axis: AxisState, frame: Frame) -> float:
-        """s between two answers, by the interface's stamps; by our sending where its clock was set meanwhile."""
+    def _elapsed(self, axis: AxisState, frame: Frame, now_ns: int) -> float:
+        """s between two answers, by the interface's stamps; by our sending where its clock was set meanwhile.
+
+        Each answer was on the wire less than the stale time before we took it in, or it stops the arm. So what lies
+        between two of them differs by less than that from what lies between their being taken in, also where several
+        cycles' answers come late and at once.
+        """
         period = self.period_ns * 1e-9
-        sent = max((self._sent_ns - axis.t_told_ns) * 1e-9, 0.25 * period)
-        stamped = frame.stamp - axis.stamp
-        return stamped if stamped > 0.25 * period and abs(stamped - sent) < 2.0 * period else sent
+        stamped, received = frame.stamp - axis.stamp, (now_ns - axis.t_rx_ns) * 1e-9
+        if stamped > 0.25 * period and abs(stamped - received) < self._stale_ns * 1e-9:
+            return stamped
+        return max((self._sent_ns - axis.t_told_ns) * 1e-9, 0.25 * period)
 
     def _strange(self, frame: Frame, now_ns: int) -> None:
         self.counters.unknown += 1
@@ -165,6 +176,10 @@ class Stream:
         for found in self._watch.bus(self.link.health, self.seq, now_ns):
             self._note(found)
         for i, axis in enumerate(self.axes):
+            if axis.seq < self.seq:
+                self.counters.missed += 1
+                self.counters.missed_by_us += self._was_late
+                axis.lost += 1
             for found in self._watch.axis(i, axis, self.seq, now_ns, self.expects_power[i]):
                 self._note(found)
             if self.expects_power[i]:
@@ -175,10 +190,6 @@ class Stream:
 
     def _note(self, found: Found) -> None:
         self.counters.found[found.fault] = self.counters.found.get(found.fault, 0) + 1
-        if found.fault is Fault.MISSED:
-            self.counters.missed += 1
-            self.axes[found.axis or 0].lost += 1
-            self.counters.missed_by_us += self._was_late
         if found.rule.reaction is Reaction.WARN:
             return
         if all((found.fault, found.axis) != (known.fault, known.axis) for known in self.found):

@@ -39,13 +39,13 @@ class AxisState:
     gained: float = 0.0  # rad/s that all torques since the newest answer add until the next cycle begins
     surprise: float = 0.0  # rad/s by which the newest answer is off what the torques should have made of the one before
     q_smooth: float = 0.0  # rad, of that estimate
-    t_rx_ns: int = 0  # of the newest answer
+    t_rx_ns: int = 0  # of the newest answer; before the first, of the first question
     t_told_ns: int = 0  # when we sent what it answers
     stamp: float = 0.0  # s, of the interface's own clock
     seq: int = 0  # of our cycle that it answers
     beat_ns: int = 0  # of the newest heartbeat; 0: none yet
     emergency: str = ""
-    lost: int = 0  # answers, in all
+    lost: int = 0  # answers that never came, in all
     faults: set[Fault] = field(default_factory=set)
 
     def take_speed(self, told: Feedback, elapsed: float, gained: float) -> None:

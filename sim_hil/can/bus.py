@@ -77,6 +77,11 @@ class Bus:
         queue.append((t_ns, frame, self.duration_ns(frame)))
         return True
 
+    @property
+    def is_busy(self) -> bool:
+        """Somebody waits to send, or to be told."""
+        return bool(self._told) or any(self._queues.values())
+
     def next(self, until_ns: int | None = None) -> Delivery | None:
         """The next frame that ends by then (None: ever), or the next thing that a controller tells its node."""
         while not self._told and (first := [(*queue[0], node) for node, queue in self._queues.items() if queue]):

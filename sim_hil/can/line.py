@@ -1,4 +1,4 @@
-"""Bus, drives and mechanics in one time, without sockets: in lockstep (`advance`) or at the pace of a real clock."""
+"""Bus, drives and mechanics in one time, without sockets: in lockstep, or led by a real clock (`server`)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,6 @@ class Line:
 
     def __init__(self, drives: Sequence[Drive], mechanics: Mechanics, bus: Bus | None = None) -> None:
         self.drives, self.mechanics, self.bus = drives, mechanics, bus or Bus()
-        self.now_ns = 0
         self.listeners: list[Callable[[Delivery], None]] = []
         self.lose: Counter[int] = Counter()
         self.late: dict[int, int] = {}
@@ -70,12 +69,21 @@ class Line:
         self.gone = False  # the interface of every client is unplugged
         self.full = 0  # frames that the clients' transmit queues will refuse
         self.blocked: set[int] = set()  # joints that something holds
-        self._tick_ns = TICK_NS
-        self._ticked_ns = 0
+        self.begin(0)
         for i in range(len(drives)):
             self.bus.join(FIRST_DRIVE + i)
 
-    def next(self, until_ns: int | None = None) -> Delivery | None:
+    def begin(self, t_ns: int) -> None:
+        """It is `t_ns` now; what lies before nobody has lived through."""
+        self.now_ns = self._ticked_ns = t_ns
+        self._tick_ns = t_ns + TICK_NS
+
+    @property
+    def due_ns(self) -> int:
+        """When the next tick is."""
+        return self._tick_ns
+
+    def next(self, until_ns: int) -> Delivery | None:
         """The next frame on the wire by then, heard and answered by the drives."""
         delivery = self.bus.next(until_ns)
         if delivery is not None:
@@ -86,7 +94,7 @@ class Line:
         return delivery
 
     def advance(self, until_ns: int) -> Delivery | None:
-        """Lockstep: the next frame until then; None: it is `until_ns` now."""
+        """The next frame until then, after every tick that is due before it; None: it is `until_ns` now."""
         while True:
             stop_ns = min(until_ns, self._tick_ns)
             if (delivery := self.next(stop_ns)) is not None:
@@ -97,6 +105,13 @@ class Line:
                 return None
             self.tick(self._tick_ns)
             self._tick_ns += TICK_NS
+
+    def settle(self) -> Delivery | None:
+        """The next frame that waits on the bus, however long it takes; None: there is none."""
+        while self.bus.is_busy:
+            if (delivery := self.advance(self._tick_ns)) is not None:
+                return delivery
+        return None
 
     def tick(self, t_ns: int) -> None:
         """One tick of drives and mechanics, at `t_ns` of the bus."""

@@ -28,6 +28,7 @@ class Settings:
     timeout: int = 0  # 50 us units; 0: it never notices silence
     serial: int = 1
     firmware: int = 5013
+    mode: int = 1  # MIT
     holds: bool = True
     hold_kp: float = 10.0  # Nm/rad and Nms/rad of the hold that follows silence, ASSUMED
     hold_kd: float = 0.2
@@ -121,7 +122,7 @@ class MitDrive:
         spans = {21: s.position, 22: s.velocity, 23: s.torque}
         if number in spans:
             return data[:4] + struct.pack("<f", spans[number])
-        told = {7: self.answer_id, 8: node, 9: s.timeout, 10: 1, 13: 1, 14: s.firmware, 15: s.serial}
+        told = {7: self.answer_id, 8: node, 9: s.timeout, 10: s.mode, 13: 1, 14: s.firmware, 15: s.serial}
         return data[:4] + struct.pack("<I", told.get(number, 0))
 
     # --- the power stage -----------------------------------------------------------------------------------------

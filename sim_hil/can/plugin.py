@@ -2,7 +2,8 @@
 
 NAME is an abstract Unix socket: it leaves no file behind and does not leave this machine. With `line=` a client is
 on a `Line` of its own process instead, in lockstep: time passes only while it waits to receive.
-One datagram a frame: eight bytes of bus time in ns, then the frame as SocketCAN has it.
+One datagram a frame: eight bytes of time in ns (monotonic, when it was sent; of the bus, when it ended), then the frame
+as SocketCAN has it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import select
 import socket
 import struct
+import time
 from collections import deque
 from typing import Any
 
@@ -102,7 +104,7 @@ class _Socket:
 
     def send(self, frame: Frame) -> None:
         try:
-            self._link.send(STAMP.pack(0) + pack(frame))
+            self._link.send(STAMP.pack(time.monotonic_ns()) + pack(frame))
         except OSError as failed:
             raise can.CanOperationError(f"the simulated bus does not take the frame: {failed.strerror}") from failed
 

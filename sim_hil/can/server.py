@@ -1,8 +1,10 @@
 """The simulated bus as a process: clients on a Unix socket, drives and arm inside, one bit clock for all.
 
-Frames are stamped with the bus time at which they would have ended and passed on at once: sleeping for 100 us is
-nothing that this operating system can do. What the wire cannot carry in time is refused to its sender by an error
-frame.
+What happens does not depend on how punctual this process is: a frame is on the bus from when its client sent it, and
+every tick of drives and arm comes before the frames that end after it. A late process only tells late. To answer, the
+bus runs ahead of the real clock by the bit times of what waits: frames are stamped with the bus time at which they end
+and passed on at once, because sleeping for 100 us is nothing that this operating system can do. What the wire cannot
+carry in time is refused to its sender by an error frame.
 Exit code 0 after SIGTERM or SIGINT, 1 without a bus of the cell, 2 for bad input.
 """
 
@@ -11,11 +13,13 @@ from __future__ import annotations
 import argparse
 import select
 import socket
+import struct
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +30,15 @@ from asc_rt import launch, realtime
 from asc_rt.bus import BusError
 from asc_rt.config import Cell, ConfigError, load_cell
 from sim_hil.can.arms import ARMS
-from sim_hil.can.bus import Bus
+from sim_hil.can.bus import Bus, Delivery
 from sim_hil.can.faults import Fault, due, heard, parse_script, read_script
-from sim_hil.can.frames import pack, unpack
+from sim_hil.can.frames import Frame, pack, unpack
 from sim_hil.can.line import TICK_NS, Line
 from sim_hil.can.plugin import MAX_RECORD, STAMP, address, is_for, refusal
 from sim_hil.world import World
 
 PRIORITY = 40  # SCHED_FIFO; below the control process
-LONGEST_STEP = 20  # ticks that are made up for; a longer pause of this process is lost time
+LONGEST_PAUSE_NS = 100_000_000  # of this process, that is made up for; more is lost time
 KEYS = ("arm", "start_deg", "stand", "nasty", "faults")
 
 
@@ -76,15 +80,11 @@ class Server:
         self._door.listen()
 
     def serve(self, stop: list[int], script: list[Fault], take_fault: Callable[[], bytes | None]) -> None:
-        """Until `stop` is not empty. Faults of the script are due from the first client on, others at once.
-
-        Ticks have the time at which they were due and come before anybody is heard: late or not, a drive tells where
-        the arm is by the clock of the bus.
-        """
-        due_ns = time.monotonic_ns()
+        """Until `stop` is not empty. Faults of the script are due from the first client on, others at once."""
+        self.line.begin(time.monotonic_ns())
         began_ns = 0
         while not stop:
-            wait = max(0, due_ns - time.monotonic_ns()) * 1e-9
+            wait = max(0, self.line.due_ns - time.monotonic_ns()) * 1e-9
             readable, _, _ = select.select([self._door, *self._clients.values()], [], [], wait)
             now_ns = time.monotonic_ns()
             began_ns = began_ns or (now_ns if self._clients else 0)
@@ -92,33 +92,43 @@ class Server:
                 fault.strike(self.line)
             for fault in heard(take_fault):
                 fault.strike(self.line)
-            behind = max(0, (now_ns - due_ns) // TICK_NS + 1)
-            due_ns += behind * TICK_NS
-            for past in range(min(behind, LONGEST_STEP), 0, -1):
-                self.line.tick(due_ns - past * TICK_NS)
-            self._hear(readable)
+            if now_ns - self.line.now_ns > LONGEST_PAUSE_NS:
+                self.line.begin(now_ns - LONGEST_PAUSE_NS)
+            self._take(self._heard(readable))
+            self._tell(partial(self.line.advance, now_ns))
+            self._tell(self.line.settle)
 
     def close(self) -> None:
         for client in self._clients.values():
             client.close()
         self._door.close()
 
-    def _hear(self, readable: list[socket.socket]) -> None:
-        now_ns = time.monotonic_ns()
+    def _heard(self, readable: list[socket.socket]) -> list[tuple[int, int, Frame]]:
+        """(when, from whom, what) clients have sent, in the order of time."""
         if self._door in readable:
             self._admit()
+        frames: list[tuple[int, int, Frame]] = []
         for node, client in list(self._clients.items()):
             if client in readable:
-                self._drain(node, client, now_ns)
-        self._pass_on()
+                frames += self._drain(node, client)
+        return sorted(frames, key=lambda sent: sent[0])
 
-    def _pass_on(self) -> None:
-        while (delivery := self.line.next()) is not None:
-            record = STAMP.pack(delivery.t_ns) + pack(delivery.frame)
-            for node, client in self._clients.items():
+    def _take(self, frames: list[tuple[int, int, Frame]]) -> None:
+        """Each at its time, if that is not over yet."""
+        for t_ns, node, frame in frames:
+            self._tell(partial(self.line.advance, t_ns))
+            if not self.line.bus.submit(node, frame, max(t_ns, self.line.now_ns)) and node in self._clients:
+                self._send(node, t_ns, refusal())
+
+    def _tell(self, following: Callable[[], Delivery | None]) -> None:
+        while (delivery := following()) is not None:
+            for node in self._clients:
                 if is_for(delivery, node):
-                    with suppress(OSError):  # a client that does not read loses frames, as on a wire
-                        client.send(record)
+                    self._send(node, delivery.t_ns, delivery.frame)
+
+    def _send(self, node: int, t_ns: int, frame: Frame) -> None:
+        with suppress(OSError):  # a client that does not read loses frames, as on a wire
+            self._clients[node].send(STAMP.pack(t_ns) + pack(frame))
 
     def _admit(self) -> None:
         client, _ = self._door.accept()
@@ -127,25 +137,25 @@ class Server:
         self.line.bus.join(self._next)
         self._next += 1
 
-    def _drain(self, node: int, client: socket.socket, now_ns: int) -> None:
+    def _drain(self, node: int, client: socket.socket) -> list[tuple[int, int, Frame]]:
+        frames: list[tuple[int, int, Frame]] = []
         while True:
             try:
                 raw = client.recv(MAX_RECORD)
-                frame = unpack(raw[STAMP.size :]) if raw else None
+                if raw:
+                    sent_ns = min(STAMP.unpack_from(raw)[0], time.monotonic_ns())
+                    frames.append((sent_ns, node, unpack(raw[STAMP.size :])))
+                    continue
             except BlockingIOError:
-                return
+                return frames
             except ConnectionResetError:  # it left without reading all; told once, before its last frames
                 continue
-            except (OSError, ValueError):
-                frame = None
-            if frame is None:  # gone, or it speaks another language
-                client.close()
-                del self._clients[node]
-                self.line.bus.leave(node)
-                return
-            if not self.line.bus.submit(node, frame, now_ns):
-                with suppress(OSError):
-                    client.send(STAMP.pack(now_ns) + pack(refusal()))
+            except (OSError, ValueError, struct.error):
+                pass
+            client.close()  # gone, or it speaks another language
+            del self._clients[node]
+            self.line.bus.leave(node)
+            return frames
 
 
 def main(argv: list[str]) -> int:

@@ -122,6 +122,13 @@ def test_approach_ending_in_closed_form(v: float, a: float, J: float) -> None:
 
 
 @settings(max_examples=300, deadline=None)
+@given(v=numbers(-2.0, 2.0), a=numbers(-10.0, 10.0), J=numbers(1.0, 300.0))
+def test_of_what_acts_at_once_the_last_control_plays_no_part(v: float, a: float, J: float) -> None:
+    u = approach_ending(v, a, T, J, True)
+    assert v + T * u + u * abs(u) / (2.0 * J) == pytest.approx(0.0, abs=1e-9 * (1.0 + abs(v)))
+
+
+@settings(max_examples=300, deadline=None)
 @given(state=states, system=systems)
 def test_greatest_approach_is_the_edge_of_what_keeps_the_row(state: Any, system: Any) -> None:
     d, v, a = state

@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import os
 import tempfile
-from typing import Any
+from typing import Any, cast
 
+import can
 import numpy as np
+from can_through import Through
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, Vector, vector
 from drivers.base import WireTap
@@ -24,14 +26,28 @@ _names = itertools.count()
 
 
 class Rig:
-    def __init__(self, arm: str, tap: WireTap | None = None, mechanics: Any = None, **options: Any) -> None:
+    """`interface`: what the frames go through, see `can_through`."""
+
+    def __init__(
+        self,
+        arm: str,
+        tap: WireTap | None = None,
+        mechanics: Any = None,
+        interface: str = "asc-sim",
+        **options: Any,
+    ) -> None:
         data = ARMS[arm]
         drives = data.drives(False)
         self.line = Line(drives, mechanics or joints(arm, len(drives)), Bus(data.bitrate, data.data_bitrate or 1e6))
         name = f"rig-{os.getpid()}-{next(_names)}"
-        table = {"interface": "asc-sim", "channel": name, "arm": arm, "listen_s": 0.02, "hold_s": 0.05}
+        table = {"interface": interface, "channel": name, "arm": arm, "listen_s": 0.02, "hold_s": 0.05}
         table |= {"lock_dir": tempfile.gettempdir(), **options}
-        self.driver = Can(table, tap, lambda: SimulatedBus(name, line=self.line), self.now_ns)
+
+        def open_bus() -> can.BusABC:
+            bus = SimulatedBus(name, line=self.line)
+            return bus if interface == "asc-sim" else cast(can.BusABC, Through(interface, data.data_bitrate > 0.0, bus))
+
+        self.driver = Can(table, tap, open_bus, self.now_ns)
         self.period_ns = round(table.get("period_ms", 4.0) * 1e6)
         self._due_ns = 0
 

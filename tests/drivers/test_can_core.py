@@ -23,12 +23,17 @@ from asc_rt.core.types import (
     HumanState,
     Mode,
     OperatorEvent,
+    Status,
     StopReason,
     vector,
 )
 from drivers.base import JointState
 from sim_hil.can.line import TICK_NS
+from sim_hil.person import Person
 from sim_hil.plant import MujocoPlant
+from sim_hil.trials.episode import Armer
+from sim_hil.trials.judge import Judge
+from sim_hil.trials.sensing import Camera, Quality
 
 NOBODY = HumanState(
     0, 1, 1, 0, Health.OK, 1.0, True, *[np.zeros((0, 3))] * 4, *[np.zeros(0)] * 3, np.zeros(0, np.int64)
@@ -74,24 +79,40 @@ class Session:
     def run(self, cycles: int, goal: Goal | None = None, arm: bool = False) -> list[CycleOutputs]:
         made = []
         for k in range(cycles):
-            self.rig.wait()
-            joint = self.rig.driver.read(self.rig.now_ns() + self.period_ns // 4)
+            joint = self.sample()
             events = (OperatorEvent(self.tick + 1, EventKind.ARM),) if arm and k == 0 else ()
-            x = self.inputs(joint, goal, events)
-            self.state, out = step(self.system, self.state, x)
-            if out.command is not None:
-                self.rig.driver.write(out.command)
+            out = self.decide(self.inputs(joint, NOBODY, 0, goal, events))
             if out.stop is not None:
-                self.rig.driver.stop(out.stop)
                 break
             made.append(out)
-            self.tick += 1
         return made
 
-    def inputs(self, joint: JointState | None, goal: Goal | None, events: tuple[OperatorEvent, ...]) -> CycleInputs:
+    def sample(self) -> JointState | None:
+        self.rig.wait()
+        return self.rig.driver.read(self.rig.now_ns() + self.period_ns // 4)
+
+    def decide(self, x: CycleInputs) -> CycleOutputs:
+        self.state, out = step(self.system, self.state, x)
+        if out.command is not None:
+            self.rig.driver.write(out.command)
+        if out.stop is not None:
+            self.rig.driver.stop(out.stop)
+        self.tick += 1
+        return out
+
+    def inputs(
+        self,
+        joint: JointState | None,
+        human: HumanState,
+        age_ns: int,
+        goal: Goal | None,
+        events: tuple[OperatorEvent, ...] = (),
+    ) -> CycleInputs:
         now = self.rig.now_ns()
-        human = dataclasses.replace(NOBODY, t_capture_ns=now, seq=self.tick)
-        return CycleInputs(self.tick, now, self.period_ns, joint, human, 0, heard(human, 0), goal, events, 0, False)
+        human = dataclasses.replace(human, t_capture_ns=now - age_ns, seq=self.tick)
+        return CycleInputs(
+            self.tick, now, self.period_ns, joint, human, age_ns, heard(human, age_ns), goal, events, 0, False
+        )
 
     @property
     def q(self) -> np.ndarray:
@@ -130,3 +151,35 @@ def test_a_drive_that_fails_in_motion_ends_the_session_and_the_rest_of_the_arm_s
     session.rig.run(500_000_000)
     np.testing.assert_allclose(session.q[:6], rest[:6], atol=0.02)
     assert np.max(np.abs(session.rig.line.mechanics.dq[:6])) < 0.02
+
+
+@pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
+@pytest.mark.parametrize(
+    ("seconds", "seed"), [(15.0, 1), *[pytest.param(60.0, seed, marks=pytest.mark.slow) for seed in range(2, 6)]]
+)
+def test_beside_a_person_it_comes_no_closer_by_itself_and_does_not_shake(name: str, seconds: float, seed: int) -> None:
+    """Who walks in and out and reaches, seen at 60 Hz, 30 to 45 ms old, with noise. The speeds are the driver's: told
+    in coarse steps, or differenced."""
+    session, cell = Session(name), load_cell(name)
+    plant, T = session.rig.line.mechanics.plant, session.period_ns * 1e-9
+    person, operator, judge = Person(seed), Armer(T), Judge(session.system, plant)
+    camera = Camera(person, Quality(60.0, (0.03, 0.045), 0.01, 0.1, 0.02, 0.3), seed)
+    goals, goal, changes = [vector(q) for q in cell.goals], None, []
+    for k in range(round(seconds / T)):
+        plant.set_person(person.at(k * T))
+        judge.look(k * T)
+        joint, seen = session.sample(), camera.at((k + 1) * T)
+        if k > 10 and (goal is None or session.state.reached_id == goal.id):
+            number = 1 if goal is None else goal.id + 1
+            goal = Goal(number, goals[number % len(goals)])
+        x = session.inputs(joint, seen[0] if seen else NOBODY, round(seen[1] * 1e9) if seen else 0, goal)
+        before = session.state
+        out = session.decide(dataclasses.replace(x, events=operator.events(session.state, x)))
+        judge.note(k * T, before, session.state, out)
+        if out.decision.status is Status.FILTERED:
+            changes.append(np.max(np.abs(session.state.ddq_cmd - before.ddq_cmd)))
+    assert session.state.mode is Mode.ACTIVE and session.state.reached_id > seconds / 6.0
+    print(name, seed, "least distance", judge.min_distance, "goals", session.state.reached_id, np.median(changes))
+    assert judge.robot_caused == 0 and judge.infeasible == 0 and judge.stops == 0
+    assert np.median(changes) < 2.0, "rad/s2 from one cycle to the next while a row binds"
+    assert session.rig.driver.report()["missed"] == 0

@@ -1,0 +1,245 @@
+"""A line of the start-up checklist for each thing that can be wrong before an arm moves: it is refused by that line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from can_rig import Rig
+
+from drivers.base import HandshakeError, LinkError
+from drivers.can import arms, start_up
+from drivers.can.driver import Can
+from sim_hil.can import cia402_drive
+from sim_hil.can.line import FIRST_DRIVE
+
+SICK = 3  # the drive that is not as it should be, counted from 0
+
+
+class Corrupt(Counter[int]):
+    """So many frames of every client are destroyed, whenever it comes."""
+
+    def __missing__(self, node: int) -> int:
+        return 17 if node < FIRST_DRIVE else 0
+
+
+def drive(rig: Rig) -> Any:
+    return rig.line.drives[SICK]
+
+
+def ignores(rig: Rig, method: str) -> None:
+    setattr(drive(rig), method, lambda *_: None)
+
+
+def keeps_its_timeout(rig: Rig) -> None:
+    answer = drive(rig)._register
+    drive(rig)._register = lambda data: answer(data[:2] + b"\x33" + data[3:] if data[2] == 0x55 else data)
+
+
+def refuses_its_timeout(rig: Rig) -> None:
+    serve, write_1017 = drive(rig)._serve, b"\x17\x10"
+    abort = struct.pack("<BHBI", 0x80, 0x1017, 0, cia402_drive.READ_ONLY)
+    drive(rig)._serve = lambda data: abort if data[0] >> 5 == 1 and data[1:3] == write_1017 else serve(data)
+
+
+def never_enables(rig: Rig) -> None:
+    control = drive(rig)._control
+    drive(rig)._control = lambda word: control(word & ~0x08)
+
+
+BEFORE: dict[str, tuple[str, str, Callable[[Rig], Any]]] = {  # arm, line, what is wrong when the bus is opened
+    "another master speaks": ("openarm", "listen", lambda rig: rig.strike("babble", 0, 0x55)),
+    "a drive is missing": ("openarm", "scan", lambda rig: setattr(drive(rig), "is_silent", True)),
+    "a node is missing": ("panda", "scan", lambda rig: setattr(drive(rig), "is_silent", True)),
+    "two with one identifier": ("openarm", "scan", lambda rig: rig.line.echo.add(SICK)),
+    "two with one node number": ("panda", "scan", lambda rig: rig.line.echo.add(SICK)),
+    "another drive": ("openarm", "axis 4 identity", lambda rig: setattr(drive(rig).settings, "serial", 1)),
+    "another node": ("panda", "axis 4 identity", lambda rig: drive(rig)._od.update({(0x1018, 4): 1})),
+    "firmware": ("openarm", "axis 4 firmware", lambda rig: setattr(drive(rig).settings, "firmware", 1)),
+    "revision": ("panda", "axis 4 firmware", lambda rig: drive(rig)._od.update({(0x1018, 3): 1})),
+    "control mode": ("openarm", "axis 4 mode", lambda rig: setattr(drive(rig).settings, "mode", 2)),
+    "no torque mode": ("panda", "axis 4 modes", lambda rig: drive(rig)._od.update({(0x6502, 0): 0x180})),
+    "velocity range": ("openarm", "axis 4 scale", lambda rig: setattr(drive(rig).settings, "velocity", 10.001)),
+    "gear": ("panda", "axis 4 scale", lambda rig: drive(rig)._od.update({(0x6091, 1): 101})),
+    "rated torque": ("panda", "axis 4 scale", lambda rig: drive(rig)._od.update({(0x6076, 0): 86_999})),
+    "destroyed frames": ("openarm", "bus state", lambda rig: setattr(rig.line.bus, "corrupt", Corrupt())),
+}
+
+
+def held_up(rig: Rig) -> None:
+    """Nobody answers for a while; then all is well."""
+    deaf, begin = rig.driver._link.receive, rig.now_ns()
+
+    def receive(deadline_ns: int) -> Any:
+        if begin + 40_000_000 < rig.now_ns() < begin + 80_000_000:
+            rig.run(max(0, deadline_ns - rig.now_ns()))
+            return None
+        return deaf(deadline_ns)
+
+    rig.driver._link.receive = receive  # type: ignore[method-assign]
+
+
+AFTER: dict[str, tuple[str, str, Callable[[Rig], Any]]] = {  # what goes wrong once the bus is known to be well
+    "a drive in fault": ("openarm", "power", lambda rig: rig.strike("trip", SICK + 1)),
+    "no voltage": ("panda", "power", lambda rig: rig.strike("safe_torque_off", SICK + 1)),
+    "lost answers": ("openarm", "rehearsal", lambda rig: rig.strike("lose", SICK + 1, 3)),
+    "lost frames of a node": ("panda", "rehearsal", lambda rig: rig.strike("lose", SICK + 1, 3)),
+    "answers too late": ("openarm", "rehearsal", held_up),
+    "an arm that swings": ("openarm", "seed", lambda rig: rig.line.mechanics.dq.__setitem__(0, 2.5)),
+    "out of its range": ("openarm", "home", lambda rig: rig.line.mechanics.q.__setitem__(SICK, -0.2)),
+    "keeps its time-out": ("openarm", "axis 4 watchdog", keeps_its_timeout),
+    "refuses its time-out": ("panda", "axis 4 watchdog", refuses_its_timeout),
+    "ignores to be enabled": ("openarm", "enable axis 4", lambda rig: ignores(rig, "_special")),
+    "is never ready": ("panda", "enable axis 4", never_enables),
+    "gives way": ("openarm", "hold", lambda rig: rig.line.mechanics.load.__setitem__(0, 12.0)),
+}
+
+
+def rig_of(arm: str, **options: Any) -> Rig:
+    first = 1000 if arm == "openarm" else 2000
+    rig = Rig(arm, serials=tuple(range(first, first + 7)), **options)
+    rig.line.on_stand = arm == "openarm"
+    return rig
+
+
+@pytest.mark.parametrize("wrong", BEFORE)
+def test_what_is_wrong_on_the_bus_refuses_the_start(wrong: str) -> None:
+    arm, line, spoil = BEFORE[wrong]
+    rig = rig_of(arm)
+    spoil(rig)
+    with pytest.raises(HandshakeError, match=f"start-up refused: .*{line}: ") as refused:
+        rig.driver.configure()
+    assert refused.value.hint
+    assert [found.name for found in rig.driver.checklist if not found.ok][0] == line
+    assert not any(d.is_enabled for d in rig.line.drives)
+
+
+@pytest.mark.parametrize("wrong", AFTER)
+def test_what_goes_wrong_with_the_arm_refuses_the_start(wrong: str) -> None:
+    arm, line, spoil = AFTER[wrong]
+    rig = rig_of(arm, hold_s=0.3)
+    rig.line.on_stand &= line != "seed"
+    rig.driver.configure()
+    spoil(rig)
+    with pytest.raises(HandshakeError, match=f"start-up refused: {line}: ") as refused:
+        rig.driver.activate(rig.period_ns)
+    assert refused.value.hint
+    if not line.startswith(("enable", "hold")):
+        assert not any(d.is_enabled for d in rig.line.drives), "nothing is enabled before all is known to be well"
+
+
+@pytest.mark.parametrize("arm", ["openarm", "panda"])
+def test_without_anything_wrong_it_starts(arm: str) -> None:
+    rig = rig_of(arm)
+    rig.driver.configure()
+    rig.driver.activate(rig.period_ns)
+    assert all(found.ok for found in rig.driver.checklist) and all(d.is_enabled for d in rig.line.drives)
+    lines = {found.name.split()[-1] if found.name.startswith("axis") else found.name for found in rig.driver.checklist}
+    assert {
+        "robot",
+        "bit timing",
+        "bus load",
+        "when this PC dies",
+        "listen",
+        "scan",
+        "bus state",
+        "rehearsal",
+        "home",
+    } < lines
+    assert {"identity", "firmware", "scale", "watchdog", "hold"} < lines
+
+
+def test_a_setting_that_a_drive_does_not_take_refuses_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cia402_drive, "_WRITABLE", cia402_drive._WRITABLE - {0x605A})
+    rig = rig_of("panda")
+    with pytest.raises(HandshakeError, match="axis 1: node 1: "):
+        rig.driver.configure()
+
+
+def test_without_a_bus_there_is_no_start(tmp_path: Path) -> None:
+    options = {"interface": "asc-sim", "channel": "nobody-serves-this", "arm": "openarm", "lock_dir": str(tmp_path)}
+    with pytest.raises(LinkError, match="start-up refused: robot: ") as refused:
+        Can(options).configure()
+    assert refused.value.hint
+
+
+def test_a_cycle_that_fills_the_bus_refuses_the_start_with_the_figure() -> None:
+    with pytest.raises(HandshakeError, match=r"bus load: \d+\.\d% of 1 Mbit/s in the worst case, at most 80%"):
+        rig_of("panda", period_ms=2.0).driver.configure()
+
+
+def test_a_drive_that_goes_limp_in_silence_is_refused_without_a_brake(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = arms.ARMS["openarm"]
+    limp = [dataclasses.replace(joint, holds_on_silence=i != SICK) for i, joint in enumerate(whole.joints)]
+    monkeypatch.setitem(arms.ARMS, "openarm", dataclasses.replace(whole, joints=tuple(limp)))  # type: ignore[type-var]
+    with pytest.raises(HandshakeError, match=r"when this PC dies: axes \[4\] have no brake and go limp"):
+        rig_of("openarm").driver.configure()
+
+
+@pytest.mark.parametrize(
+    ("left", "told"),
+    [
+        (None, "the last session did not end cleanly"),
+        ("nonsense", "the last session did not end cleanly"),
+        (json.dumps({"q": [0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.0]}), r"axis 4 by -0\.040 rad"),
+    ],
+)
+def test_an_arm_that_is_not_where_it_was_left_is_refused(tmp_path: Path, left: str | None, told: str) -> None:
+    home = tmp_path / "home.json"
+    if left is not None:
+        home.write_text(left)
+    rig = rig_of("openarm", home=str(home))
+    rig.driver.configure()
+    with pytest.raises(HandshakeError, match=f"start-up refused: home: {told}"):
+        rig.driver.activate(rig.period_ns)
+
+
+def test_a_clean_end_keeps_the_pose_for_the_next_start(tmp_path: Path) -> None:
+    home = tmp_path / "home.json"
+    home.write_text(json.dumps({"q": [0.0] * 7}))
+    rig = rig_of("openarm", home=str(home))
+    for _ in range(2):
+        rig.driver.configure()
+        rig.driver.activate(rig.period_ns)
+        assert not home.exists(), "while a session runs the pose is not known"
+        rig.driver.stop()
+        np.testing.assert_allclose(json.loads(home.read_text())["q"], rig.line.mechanics.q, atol=1e-3)
+
+
+def shown(**changes: Any) -> str:
+    """As `ip -details -json link show can0` tells."""
+    data = {"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 1000000, "sample_point": "0.750"}}
+    data |= {"data_bittiming": {"bitrate": 5000000, "sample_point": "0.750"}}
+    link = {"ifname": "can0", "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"], "mtu": 72, "txqlen": 64}
+    kind = changes.pop("kind", "can")
+    data |= changes.pop("data", {})
+    return json.dumps([link | changes | {"linkinfo": {"info_kind": kind, "info_data": data}}])
+
+
+@pytest.mark.parametrize(
+    ("told", "wrong"),
+    [
+        (shown(), ""),
+        (shown(flags=["NOARP"]), "is down"),
+        (shown(data={"bittiming": {"bitrate": 500000}}), "500000 bit/s, not 1000000"),
+        (shown(data={"data_bittiming": {"bitrate": 2000000}}), "2000000 bit/s in the data phase, not 5000000"),
+        (shown(mtu=16), "carries no CAN FD"),
+        (shown(txqlen=10), "queue of 10 frames, at least 64"),
+        ("[]", "no such interface"),
+        ("", "no such interface"),
+    ],
+)
+def test_the_bit_timing_of_a_socketcan_interface_is_checked(
+    monkeypatch: pytest.MonkeyPatch, told: str, wrong: str
+) -> None:
+    monkeypatch.setattr(start_up, "shown_by_ip", lambda channel: told)
+    line = start_up.bit_timing(arms.ARMS["openarm"], "socketcan", "can0")
+    assert line.name == "bit timing" and line.ok is not bool(wrong)
+    assert wrong in line.detail and line.fix
