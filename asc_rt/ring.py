@@ -72,8 +72,8 @@ class _Ring:
             self._map = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ)
         finally:
             os.close(fd)
-        self._bytes = memoryview(self._map)
-        self._words = self._bytes.cast("Q")
+        self.memory = memoryview(self._map)
+        self._words = self.memory.cast("Q")
         self.slot_size, self.slots = self._words[_SLOT_SIZE], self._words[_SLOTS]
         self._stride = _stride(self.slot_size)
         if self._words[_MAGIC] != MAGIC or size != HEADER_SIZE + self.slots * self._stride:
@@ -100,12 +100,12 @@ class _Ring:
         offset = HEADER_SIZE + index % self.slots * self._stride
         word = offset >> 3
         size = min(self._words[word + 1], self.slot_size)
-        payload = bytes(self._bytes[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size])
+        payload = bytes(self.memory[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size])
         return payload if self._words[word] == index + 1 else None
 
     def _unmap(self) -> None:
         self._words.release()
-        self._bytes.release()
+        self.memory.release()
         self._map.close()
 
     def __enter__(self) -> Self:
@@ -119,22 +119,34 @@ class _Ring:
 
 
 class RingWriter(_Ring):
-    """The one producer."""
+    """The one producer. It goes on where the last one ended."""
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(path)
+        self._next = self._words[_HEAD]
+        self._word = 0  # of the slot that was begun
 
     def put(self, payload: bytes | bytearray | memoryview) -> None:
         """Copy the payload into the next slot. Never waits. ValueError: larger than a slot."""
-        size = len(payload)
+        at = self.begin(len(payload))
+        self.memory[at : at + len(payload)] = payload
+        self.end()
+
+    def begin(self, size: int) -> int:
+        """Where in `memory` the payload of the next slot is to be written; `end` hands it over. Without that nobody has
+        seen it: `begin` may be called again. Never waits. ValueError: larger than a slot."""
         if size > self.slot_size:
             raise ValueError(f"{size} bytes do not fit into a slot of {self.slot_size}")
-        words = self._words
-        index = words[_HEAD]
-        offset = HEADER_SIZE + index % self.slots * self._stride
-        word = offset >> 3
-        words[word] = 0
-        words[word + 1] = size
-        self._bytes[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size] = payload
-        words[word] = index + 1
-        words[_HEAD] = index + 1
+        offset = HEADER_SIZE + self._next % self.slots * self._stride
+        self._word = word = offset >> 3
+        self._words[word] = 0
+        self._words[word + 1] = size
+        return offset + _SLOT_HEAD
+
+    def end(self) -> None:
+        self._next += 1
+        self._words[self._word] = self._next
+        self._words[_HEAD] = self._next
 
     @property
     def backlog(self) -> int:

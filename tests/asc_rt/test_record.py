@@ -114,6 +114,17 @@ def test_nothing_of_the_cycle_before_stays_in_the_buffer(first: tuple[Any, ...],
     assert LAYOUT.sealed(buffer) == packed(second)
 
 
+@bounded
+@given(cycles, cycles)
+def test_what_is_the_same_object_again_is_written_again(first: tuple[Any, ...], second: tuple[Any, ...]) -> None:
+    state, inputs, *rest = second
+    mixed = state, dataclasses.replace(inputs, human=first[1].human, goal=first[1].goal), *rest
+    for cycle in (first, mixed, second, mixed, first):
+        fresh, buffer = RecordLayout(N), LAYOUT.buffer()
+        fresh.pack(buffer, *cycle)
+        assert packed(cycle) == LAYOUT.sealed(buffer)
+
+
 def parsed(data: bytes | bytearray) -> Any:
     pool = descriptor_pool.DescriptorPool()
     for file in record.file_descriptor_set().file:
