@@ -185,8 +185,7 @@ class RecordLayout:
         self._parts = tuple(self.parts.values())
         pieces = [piece for part in self._parts for piece in part.pieces]
         names = {name: packer for part in self._parts for name, packer in part.names.items()}
-        arguments = ", ".join(["into, at", *self.parts])
-        self._pack_into = compiled([*pieces, self._check_tag + bytes(CHECK_SIZE)], arguments, names, "into, at")
+        self._pack_into = compiled([*pieces, self._check_tag + bytes(CHECK_SIZE)], ", ".join(self.parts), names)
         check = Leaf("check", self._check_tag, "I", "<u4", (), int, self._check_offset)
         self.leaves = [leaf for part in self._parts for leaf in part.leaves] + [check]
         self.dtype = np.dtype(

@@ -5,7 +5,7 @@ ring     in the loop: all that the recorder's `put` does, from packing the recor
          period of 1 ms, and a tenth of one once in a thousand cycles. The packets' tap is the driver's, and not in it
 logger   the other process: share of a core, with seals, at 1000 cycles and 2000 packets a second
 
-People come as often as a camera tells of them, not in every cycle.
+As in a session, people come as often as a camera tells of them, and nobody presses a button in every cycle.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _loop(cell: Cell, path: Path) -> np.ndarray[Any, np.dtype[np.int64]]:
             human = cycles[k // PEOPLE_CYCLES % SCENE_CYCLES][1].human
             t_ns = time.monotonic_ns()
             tap("rx", t_ns, REPLY)
-            x = dataclasses.replace(x, t_ns=t_ns, human=human)
+            x = dataclasses.replace(x, t_ns=t_ns, human=human, events=())
             _, out = step(scene.system, before, x)
             sent = WriteReceipt(t_ns, k, out.command.q, True) if out.command else None
             tap("tx", t_ns, COMMAND)

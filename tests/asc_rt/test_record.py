@@ -244,9 +244,12 @@ RECEIPT: WriteReceipt = plain(record.RECEIPT)
     ],
     ids=["capsules", "events", "joints", "float32", "int64"],
 )
-def test_what_does_not_fit_is_refused_and_never_cut(changes: dict[str, Any]) -> None:
+def test_what_does_not_fit_is_refused_and_never_cut_and_leaves_nothing_behind(changes: dict[str, Any]) -> None:
+    good = example()
+    before = packed(good)
     with pytest.raises(RecordError):
         packed(example(**changes))
+    assert packed(good) == before
 
 
 def test_pairs_of_unequal_length_are_refused() -> None:
