@@ -48,21 +48,23 @@ COMPLETED, FAILED, NOT_BEGUN = 0, 1, 2
 
 
 class RingRecorder:
-    """Packs each cycle into the ring. `unrecorded` counts the cycles that did not fit the record."""
+    """Packs each cycle into its slot of the ring. `unrecorded` counts the cycles that did not fit the record."""
 
     def __init__(self, ring: RingWriter, layout: RecordLayout) -> None:
         self.unrecorded = 0
-        self._ring, self._layout, self._buffer = ring, layout, layout.buffer()
+        self._ring, self._layout = ring, layout
 
     def put(
         self, before: CoreState, x: CycleInputs, out: CycleOutputs, sent: WriteReceipt | None, timings: Timings
     ) -> None:
+        ring, layout = self._ring, self._layout
+        at = ring.begin(layout.size)
         try:
-            self._layout.pack(self._buffer, before, x, out, sent, timings)
+            layout.pack(ring.memory, before, x, out, sent, timings, at)
         except RecordError:
             self.unrecorded += 1
             return
-        self._ring.put(self._buffer)
+        ring.end()
 
 
 def main(argv: list[str] | None = None) -> int:

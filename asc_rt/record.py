@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2
@@ -60,6 +60,7 @@ from asc_rt.fixed_protobuf import (
     RecordError,
     Unsigned,
     add_field,
+    compiled,
     describe,
     tag,
 )
@@ -69,8 +70,7 @@ from drivers.base import WriteReceipt
 NAME = f"{PACKAGE}.CycleRecord"
 
 
-@dataclass(frozen=True, slots=True)
-class Timings:
+class Timings(NamedTuple):
     """Monotonic ns of this cycle, for the report only: nothing that is replayed depends on them."""
 
     t_wake_ns: int  # the loop is running again: sample received, or deadline reached
@@ -183,6 +183,9 @@ class RecordLayout:
         self._check_offset = offset + len(self._check_tag)
         self.size = self._check_offset + CHECK_SIZE
         self._parts = tuple(self.parts.values())
+        pieces = [piece for part in self._parts for piece in part.pieces]
+        names = {name: packer for part in self._parts for name, packer in part.names.items()}
+        self._pack_into = compiled([*pieces, self._check_tag + bytes(CHECK_SIZE)], ", ".join(self.parts), names)
         check = Leaf("check", self._check_tag, "I", "<u4", (), int, self._check_offset)
         self.leaves = [leaf for part in self._parts for leaf in part.leaves] + [check]
         self.dtype = np.dtype(
@@ -196,9 +199,7 @@ class RecordLayout:
 
     def buffer(self) -> bytearray:
         """Room for one record, to be used again and again."""
-        made = bytearray(self.size)
-        made[self._checked : self._check_offset] = self._check_tag
-        return made
+        return bytearray(self.size)
 
     def pack(
         self,
@@ -208,11 +209,14 @@ class RecordLayout:
         outputs: CycleOutputs,
         receipt: WriteReceipt | None,
         timings: Timings,
+        at: int = 0,
     ) -> None:
-        """Write one whole record, but not its check, into what `buffer` gave. RecordError: something does not fit;
-        `into` is then no record."""
-        for part, obj in zip(self._parts, (before, inputs, outputs, receipt, timings), strict=True):
-            part.pack_into(into, obj)
+        """Write one whole record, but not its check, into what `buffer` gave, or from byte `at` of other memory on.
+        RecordError: something does not fit; `into` holds no record then."""
+        try:
+            self._pack_into(into, at, before, inputs, outputs, receipt, timings)
+        except struct.error as error:
+            raise RecordError(f"a number does not fit into the record: {error}") from error
 
     def sealed(self, record: Buffer) -> bytes:
         """The record with the check that belongs to the bytes before it."""

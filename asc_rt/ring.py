@@ -72,8 +72,8 @@ class _Ring:
             self._map = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ)
         finally:
             os.close(fd)
-        self._bytes = memoryview(self._map)
-        self._words = self._bytes.cast("Q")
+        self.memory = memoryview(self._map)
+        self._words = self.memory.cast("Q")
         self.slot_size, self.slots = self._words[_SLOT_SIZE], self._words[_SLOTS]
         self._stride = _stride(self.slot_size)
         if self._words[_MAGIC] != MAGIC or size != HEADER_SIZE + self.slots * self._stride:
@@ -95,17 +95,30 @@ class _Ring:
         """The producer has said that nothing follows."""
         return self._words[_CLOSED] != 0
 
-    def _slot(self, index: int) -> bytes | None:
-        """A copy of slot `index`; None: overwritten before or while it was copied."""
-        offset = HEADER_SIZE + index % self.slots * self._stride
-        word = offset >> 3
-        size = min(self._words[word + 1], self.slot_size)
-        payload = bytes(self._bytes[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size])
-        return payload if self._words[word] == index + 1 else None
+    def _copies(self, first: int, end: int) -> list[memoryview]:
+        """What is in the slots `first` to `end`, without those overwritten before or while they were copied. One copy
+        for all: a call for each slot is most of what a logger would do."""
+        found: list[memoryview] = []
+        while first < end:
+            place = first % self.slots
+            count = min(end - first, self.slots - place)
+            start, step = HEADER_SIZE + place * self._stride, self._stride >> 3
+            copy = memoryview(self.memory[start : start + count * self._stride].tobytes())
+            sequences = self._words[start >> 3 : (start >> 3) + count * step : step].tolist()
+            sizes = copy.cast("Q")[1::step].tolist()
+            places = range(_SLOT_HEAD, len(copy), self._stride)
+            wanted = range(first + 1, first + count + 1)
+            found += [
+                copy[at : at + size]
+                for at, size, sequence, right in zip(places, sizes, sequences, wanted, strict=True)
+                if sequence == right
+            ]
+            first += count
+        return found
 
     def _unmap(self) -> None:
         self._words.release()
-        self._bytes.release()
+        self.memory.release()
         self._map.close()
 
     def __enter__(self) -> Self:
@@ -119,22 +132,34 @@ class _Ring:
 
 
 class RingWriter(_Ring):
-    """The one producer."""
+    """The one producer. It goes on where the last one ended."""
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(path)
+        self._next = self._words[_HEAD]
+        self._word = 0  # of the slot that was begun
 
     def put(self, payload: bytes | bytearray | memoryview) -> None:
         """Copy the payload into the next slot. Never waits. ValueError: larger than a slot."""
-        size = len(payload)
+        at = self.begin(len(payload))
+        self.memory[at : at + len(payload)] = payload
+        self.end()
+
+    def begin(self, size: int) -> int:
+        """Where in `memory` the payload of the next slot is to be written; `end` hands it over. Without that nobody has
+        seen it: `begin` may be called again. Never waits. ValueError: larger than a slot."""
         if size > self.slot_size:
             raise ValueError(f"{size} bytes do not fit into a slot of {self.slot_size}")
-        words = self._words
-        index = words[_HEAD]
-        offset = HEADER_SIZE + index % self.slots * self._stride
-        word = offset >> 3
-        words[word] = 0
-        words[word + 1] = size
-        self._bytes[offset + _SLOT_HEAD : offset + _SLOT_HEAD + size] = payload
-        words[word] = index + 1
-        words[_HEAD] = index + 1
+        offset = HEADER_SIZE + self._next % self.slots * self._stride
+        self._word = word = offset >> 3
+        self._words[word] = 0
+        self._words[word + 1] = size
+        return offset + _SLOT_HEAD
+
+    def end(self) -> None:
+        self._next += 1
+        self._words[self._word] = self._next
+        self._words[_HEAD] = self._next
 
     @property
     def backlog(self) -> int:
@@ -155,23 +180,16 @@ class RingReader(_Ring):
         super().__init__(path)
         self._next = self._words[_READ]
 
-    def take(self) -> bytes | None:
+    def take(self) -> memoryview | None:
         """The oldest payload not yet taken, or None."""
-        while self._next < self.head:
-            self._next += 1
-            if (payload := self._slot(self._next - 1)) is not None:
-                return payload
-            self._words[_LOST] += 1
-        return None
+        return next(iter(self.drain(1)), None)
 
-    def drain(self, limit: int = 100) -> list[bytes]:
+    def drain(self, limit: int = 100) -> list[memoryview]:
         """The oldest payloads not yet taken, up to `limit`; none: there are no more."""
         while self._next < (head := self.head):
-            end = min(head, self._next + limit)
-            copies = [self._slot(index) for index in range(self._next, end)]
-            self._next = end
-            found = [payload for payload in copies if payload is not None]
-            self._words[_LOST] += len(copies) - len(found)
+            first, self._next = self._next, min(head, self._next + limit)
+            found = self._copies(first, self._next)
+            self._words[_LOST] += self._next - first - len(found)
             if found:
                 return found
         return []
@@ -193,12 +211,11 @@ class RingWatcher(_Ring):
         super().__init__(path, writable=False)
         self._next = 0
 
-    def new(self) -> list[bytes]:
+    def new(self) -> list[memoryview]:
         """What was put since the last look and is still there; the first time all that is there."""
         head = self.head
-        seen = [self._slot(index) for index in range(max(self._next, head - self.slots), head)]
-        self._next = head
-        return [payload for payload in seen if payload is not None]
+        first, self._next = max(self._next, head - self.slots), head
+        return self._copies(first, head)
 
 
 def _stride(slot_size: int) -> int:
@@ -244,7 +261,7 @@ def wire_tap(ring: RingWriter) -> WireTap:
     return tap
 
 
-def parse_wire(payload: bytes) -> tuple[str, int, int, bytes]:
+def parse_wire(payload: memoryview) -> tuple[str, int, int, memoryview]:
     """(direction, t_ns, length on the wire, data) of a payload of the wire ring."""
     t_ns, direction, length = _WIRE_HEAD.unpack_from(payload)
     return _DIRECTIONS[direction], t_ns, length, payload[_WIRE_HEAD.size :]

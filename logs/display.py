@@ -5,15 +5,17 @@ lines. Foxglove's messages are protobuf; the other two must be ROS 2 CDR to be r
 from __future__ import annotations
 
 import math
+import operator
 import struct
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from asc_rt.core.params import Params
 from asc_rt.core.types import Mode, StopReason
+from asc_rt.fixed_protobuf import Buffer
 from asc_rt.record import RecordLayout
 from logs import schema
 from logs.log_file import LogFile
@@ -87,7 +89,8 @@ class Display:
         self._robot, self._dtype = params.robot, layout.dtype
         self._frames = frames(params.robot.urdf)
         self._index = {name: i for i, name in enumerate(params.robot.joints)}
-        self._offsets = {path: layout.dtype.fields[path][1] for path in ("state.mode", "state.reason")}  # type: ignore[index]
+        places = [layout.dtype.fields[path][1] for path in ("state.mode", "state.reason")]  # type: ignore[index]
+        self._said_in: Callable[[Buffer], tuple[int, int]] = operator.itemgetter(*places)
         self._said = (-1, -1)
         self._next_ns = 0
         self._names = _cdr_strings(params.robot.joints)
@@ -101,8 +104,8 @@ class Display:
         text = self._robot.urdf.encode() + b"\0"
         log.message(schema.ROBOT_DESCRIPTION, t_ns, _CDR + struct.pack("<I", len(text)) + text)
 
-    def cycle(self, log: LogFile, t_ns: int, record: bytes) -> None:
-        said = (record[self._offsets["state.mode"]], record[self._offsets["state.reason"]])
+    def cycle(self, log: LogFile, t_ns: int, record: Buffer) -> None:
+        said = self._said_in(record)
         if said != self._said:
             self._tell(log, t_ns, said)
         if t_ns < self._next_ns:

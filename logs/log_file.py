@@ -90,7 +90,7 @@ class LogFile:
             self._channels[topic], self._counts[topic] = self._register(channel), 0
         first, self._counts[topic] = self._counts[topic], self._counts[topic] + len(contents)
         offset = self._wall_minus_monotonic_ns
-        wall = [max(0, t_ns + offset) for t_ns in times]
+        wall = [t_ns + offset if t_ns > -offset else 0 for t_ns in times]
         self._writer.messages(self._channels[topic], first, wall, contents)
 
     def wall_ns(self, t_ns: int) -> int:

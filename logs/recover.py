@@ -166,7 +166,7 @@ def _add_rings(writer: McapWriter, log: Log, path: Path) -> int:
     return cycles.count
 
 
-def _held(path: Path) -> Iterator[bytes]:
+def _held(path: Path) -> Iterator[memoryview]:
     with ring.RingWatcher(path) as watcher:
         yield from watcher.new()
 

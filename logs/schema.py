@@ -71,7 +71,7 @@ def _message_class(name: str, *files: descriptor_pb2.FileDescriptorProto) -> Any
 _Wire = _message_class("asc.v1.Wire", _wire_file())
 
 
-def wire_message(t_ns: int, length: int, data: bytes) -> bytes:
+def wire_message(t_ns: int, length: int, data: bytes | memoryview) -> bytes:
     """A packet of `length` bytes that passed at monotonic `t_ns`; `data`: its beginning, or all of it."""
     return _WIRE_STAMP.pack(_WIRE_STAMP_TAG, t_ns) + _wire_head(length, len(data)) + data
 

@@ -79,7 +79,7 @@ class Painter:
         self._last: Records = np.zeros(0, dtype)  # waits for the cycle after it
         self._canvas: Canvas | None = None
 
-    def paint(self, payloads: list[bytes]) -> None:
+    def paint(self, payloads: list[memoryview]) -> None:
         """All of them but the newest, which is drawn together with the next ones."""
         if not payloads:
             return

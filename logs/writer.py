@@ -27,6 +27,7 @@ from asc_rt import ring, topics
 from asc_rt.bus import Bus, BusError, Latest, Publisher, Queue, open_client
 from asc_rt.config import Cell, ConfigError, load_cell
 from asc_rt.core.types import Mode, StopReason
+from asc_rt.fixed_protobuf import Buffer
 from asc_rt.record import RecordLayout
 from logs import schema
 from logs.context import attachments, session
@@ -87,7 +88,7 @@ class Logger:
             self._state = bus.publisher(topics.STATE.key)
             self._joints = bus.publisher(topics.JOINTS.key)
         self._lost = {"cycle": 0, "wire": 0}
-        self._newest: bytes | None = None
+        self._newest: memoryview | None = None
         self._next_flush_ns = self._next_state_ns = self.last_cycle_ns = clock()
         self.records = 0
         self._unsafe = 0  # cycles taken since the last flush
@@ -234,7 +235,7 @@ class Logger:
             self._state.put_json(state_message(self._layout, self._newest, self.dropped))
 
 
-def joints_message(layout: RecordLayout, records: list[bytes]) -> dict[str, Any]:
+def joints_message(layout: RecordLayout, records: list[memoryview]) -> dict[str, Any]:
     """The samples of these cycles, for who has to know where the arm was at a capture; {}: the robot said nothing."""
     rows = np.frombuffer(b"".join(records), layout.dtype)
     rows = rows[rows["inputs.joint.present"] == 1]
@@ -243,7 +244,7 @@ def joints_message(layout: RecordLayout, records: list[bytes]) -> dict[str, Any]
     return {"t_ns": rows["inputs.joint.t_rx_ns"].tolist(), "q": rows["inputs.joint.q"].tolist()}
 
 
-def state_message(layout: RecordLayout, record: bytes, dropped: int) -> dict[str, Any]:
+def state_message(layout: RecordLayout, record: Buffer, dropped: int) -> dict[str, Any]:
     """What the newest cycle says to the slow world; `d_min_now` in m, None: nobody near. `d_goal`: the same of the arm
     at its goal; under safety.d_min_m it waits until the person makes way."""
     row = np.frombuffer(record, layout.dtype)[0]

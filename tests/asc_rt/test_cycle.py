@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from asc_rt import cycle
+from asc_rt import cycle, ring
 from asc_rt.config import load_cell
 from asc_rt.control import RingRecorder
 from asc_rt.core.system import System, initial
@@ -27,7 +29,7 @@ from asc_rt.core.types import (
 )
 from asc_rt.inputs import Mail
 from asc_rt.pacing import DevicePaced
-from asc_rt.record import Timings
+from asc_rt.record import RecordLayout, Timings
 from drivers.base import LinkError, WriteReceipt
 from tests.box import Box
 
@@ -165,21 +167,17 @@ def test_a_cycle_without_a_command_sends_nothing(system: System, monkeypatch: py
     assert bench.records[0][3] is None
 
 
-def test_a_cycle_that_does_not_fit_the_record_is_counted(system: System) -> None:
-    class Ring:
-        def __init__(self) -> None:
-            self.put_count = 0
-
-        def put(self, _: bytes) -> None:
-            self.put_count += 1
-
-    from asc_rt.record import RecordLayout
-
-    bench, ring = Bench(), Ring()
+def test_a_cycle_that_does_not_fit_the_record_is_counted(system: System, tmp_path: Path) -> None:
+    bench, layout = Bench(), RecordLayout(system.n)
     run(system, bench, Box(END))
-    recorder = RingRecorder(ring, RecordLayout(system.n))  # type: ignore[arg-type]
-    recorder.put(*bench.records[0])
-    assert (ring.put_count, recorder.unrecorded) == (1, 0)
-    wrong = RingRecorder(ring, RecordLayout(system.n + 1))  # type: ignore[arg-type]
-    wrong.put(*bench.records[0])
-    assert (ring.put_count, wrong.unrecorded) == (1, 1)
+    ring.create(tmp_path / "ring", layout.size, slots=4)
+    with ring.RingWriter(tmp_path / "ring") as writer, ring.RingReader(tmp_path / "ring") as reader:
+        recorder = RingRecorder(writer, layout)
+        before, *rest = whole = bench.records[0]
+        recorder.put(*whole)
+        recorder.put(dataclasses.replace(before, q_cmd=np.zeros(system.n + 1)), *rest)  # type: ignore[arg-type]
+        assert (recorder.unrecorded, writer.head) == (1, 1)
+        recorder.put(*whole)
+        buffer = layout.buffer()
+        layout.pack(buffer, *whole)
+        assert reader.drain() == [bytes(buffer)] * 2

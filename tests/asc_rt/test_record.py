@@ -114,6 +114,17 @@ def test_nothing_of_the_cycle_before_stays_in_the_buffer(first: tuple[Any, ...],
     assert LAYOUT.sealed(buffer) == packed(second)
 
 
+@bounded
+@given(cycles, cycles)
+def test_what_is_the_same_object_again_is_written_again(first: tuple[Any, ...], second: tuple[Any, ...]) -> None:
+    state, inputs, *rest = second
+    mixed = state, dataclasses.replace(inputs, human=first[1].human, goal=first[1].goal), *rest
+    for cycle in (first, mixed, second, mixed, first):
+        fresh, buffer = RecordLayout(N), LAYOUT.buffer()
+        fresh.pack(buffer, *cycle)
+        assert packed(cycle) == LAYOUT.sealed(buffer)
+
+
 def parsed(data: bytes | bytearray) -> Any:
     pool = descriptor_pool.DescriptorPool()
     for file in record.file_descriptor_set().file:
@@ -233,9 +244,12 @@ RECEIPT: WriteReceipt = plain(record.RECEIPT)
     ],
     ids=["capsules", "events", "joints", "float32", "int64"],
 )
-def test_what_does_not_fit_is_refused_and_never_cut(changes: dict[str, Any]) -> None:
+def test_what_does_not_fit_is_refused_and_never_cut_and_leaves_nothing_behind(changes: dict[str, Any]) -> None:
+    good = example()
+    before = packed(good)
     with pytest.raises(RecordError):
         packed(example(**changes))
+    assert packed(good) == before
 
 
 def test_pairs_of_unequal_length_are_refused() -> None:

@@ -76,7 +76,7 @@ class Racing:
 def test_a_slot_overwritten_while_it_is_copied_is_lost_not_torn(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RingWriter(path) as writer, RingReader(path) as reader:
         writer.put(payload(0))
-        monkeypatch.setattr(reader, "_bytes", Racing(reader._bytes, writer))
+        monkeypatch.setattr(reader, "memory", Racing(reader.memory, writer))
         assert reader.take() == payload(1)
         assert reader.lost == 1
 
@@ -119,6 +119,24 @@ def test_a_payload_larger_than_a_slot_is_refused(path: Path) -> None:
         with pytest.raises(ValueError, match="101 bytes"):
             writer.put(bytes(101))
         assert reader.take() is None
+
+
+def test_what_was_begun_and_given_up_was_never_there(path: Path) -> None:
+    with RingWriter(path) as writer, RingReader(path) as reader:
+        writer.memory[writer.begin(4)] = 1
+        assert reader.take() is None
+        at = writer.begin(3)
+        writer.memory[at : at + 3] = b"two"
+        writer.end()
+        assert (reader.take(), reader.take(), reader.lost) == (b"two", None, 0)
+
+
+def test_a_producer_that_comes_again_goes_on(path: Path) -> None:
+    with RingReader(path) as reader:
+        for k in range(3):
+            with RingWriter(path) as writer:
+                writer.put(payload(k))
+            assert reader.take() == payload(k)
 
 
 def produce(path: Path, count: int) -> None:

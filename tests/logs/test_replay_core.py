@@ -1,11 +1,19 @@
 """The real decision, recorded and run again: not a bit may differ."""
 
 import dataclasses
+import functools
+import inspect
 import json
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import pytest
+
+from asc_rt.core import step as step_module
 from asc_rt.core.params import Params
+from asc_rt.core.system import System
 from asc_rt.core.types import (
     CoreState,
     CycleInputs,
@@ -15,7 +23,7 @@ from asc_rt.core.types import (
 )
 from logs.commands import told
 from logs.recording import open_recording
-from logs.replay import Order, core_stepper, replay
+from logs.replay import Order, Stepper, core_stepper, replay
 from logs.whatif import _stop_changes, what_if
 
 
@@ -30,6 +38,52 @@ def test_the_core_replays_to_the_bit(core_session: tuple[Path, list[Any]]) -> No
 
 def test_several_processes_give_the_same_verdict(core_session: tuple[Path, list[Any]]) -> None:
     assert replay(core_session[0], jobs=2).as_dict() == replay(core_session[0]).as_dict()
+
+
+def changed(line: str, by: str) -> Callable[[Params], Stepper]:
+    """The decision of this code with one line of it written otherwise."""
+    source = inspect.getsource(step_module)
+    assert source.count(line) == 1
+    module = ModuleType("changed")
+    exec(compile(source.replace(line, by), "changed", "exec"), module.__dict__)
+    return lambda params: functools.partial(module.step, System(params))
+
+
+def always(cycle: Any) -> bool:
+    return True
+
+
+def moves(cycle: Any) -> bool:
+    return bool(cycle[2].command.dq.any())
+
+
+def is_filtered(cycle: Any) -> bool:
+    return bool(cycle[2].decision.status is Status.FILTERED)
+
+
+@pytest.mark.parametrize(
+    ("line", "by", "tells", "field"),
+    [
+        (
+            "= nearest_measured(system, x)",
+            "= nearest_measured(system, x) - 1e-9",
+            always,
+            "outputs.decision.d_measured",
+        ),
+        ("level.kind, point.q, point.dq,", "level.kind, point.q, point.ddq,", moves, "outputs.command.dq"),
+        ("q_cmd=point.q, dq_cmd=point.dq,", "q_cmd=point.q, dq_cmd=point.ddq,", moves, "state_after.dq_cmd"),
+        ("if not solution.feasible:", "if solution.filtered:", is_filtered, "outputs.decision.status"),
+    ],
+)
+def test_a_changed_line_of_the_core_is_found_where_it_first_tells(
+    core_session: tuple[Path, list[Any]], line: str, by: str, tells: Callable[[Any], bool], field: str
+) -> None:
+    path, cycles = core_session
+    found = replay(path, stepper=changed(line, by)).first_difference
+    assert found is not None
+    assert found.field.startswith(field)
+    assert found.cycle == next(k for k, cycle in enumerate(cycles) if tells(cycle))
+    assert found.logged != found.replayed
 
 
 def with_d_min(params: Params, d_min: float) -> Params:

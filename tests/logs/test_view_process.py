@@ -76,7 +76,7 @@ def test_a_watcher_sees_everything_and_changes_nothing(tmp_path: Path) -> None:
     with ring.RingWriter(path) as writer, ring.RingReader(path) as reader, ring.RingWatcher(path) as watcher:
         for i in range(3):
             writer.put(bytes([i]))
-        assert watcher._bytes.readonly  # whatever it does
+        assert watcher.memory.readonly  # whatever it does
         before = path.read_bytes()
         assert watcher.new() == [b"\0", b"\1", b"\2"]
         assert watcher.new() == []
