@@ -90,6 +90,5 @@ def test_held_off_by_a_person_it_stands_still(name: str) -> None:
             closing.append(float(np.max(-pairs.d_dot_robot[near], initial=0.0)))
             changes.append(float(np.max(np.abs(u - before))))
     assert state.mode is Mode.ACTIVE and out.command is not None
-    print(name, "closing", max(closing), "change of u", max(changes))
     assert max(closing) < APPROACH
     assert max(changes) < 1.0, "rad/s2 from one cycle to the next"
