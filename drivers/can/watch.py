@@ -77,10 +77,14 @@ class AxisState:
         self.gain = gain
         self.gained += gain
 
-    def carried(self, missed: int, period: float) -> int:
-        """urad that it has gone on since it told: it was asked a cycle and `missed` more ago. In whole numbers for the
-        record, so that its packets decode to the same position."""
-        return round((self.dq + 0.5 * self.gained) * (missed + 1) * period / URAD)
+    def speed(self, running: float) -> float:
+        """rad/s, once the torque of the running cycle has acted for so many periods."""
+        return self.dq + self.gained + (running - 1.0) * self.gain
+
+    def carried(self, missed: int, running: float, period: float) -> int:
+        """urad that it has gone on since it told: it was asked `missed` cycles and the running one ago. In whole
+        numbers for the record, so that its packets decode to the same position."""
+        return round(0.5 * (self.dq + self.speed(running)) * (missed + running) * period / URAD)
 
 
 @dataclass(slots=True)

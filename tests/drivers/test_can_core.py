@@ -35,6 +35,7 @@ from sim_hil.trials.episode import Armer
 from sim_hil.trials.judge import Judge
 from sim_hil.trials.sensing import Camera, Quality
 
+LONG = (pytest.mark.slow, pytest.mark.timeout(1200))
 NOBODY = HumanState(
     0, 1, 1, 0, Health.OK, 1.0, True, *[np.zeros((0, 3))] * 4, *[np.zeros(0)] * 3, np.zeros(0, np.int64)
 )
@@ -155,7 +156,7 @@ def test_a_drive_that_fails_in_motion_ends_the_session_and_the_rest_of_the_arm_s
 
 @pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
 @pytest.mark.parametrize(
-    ("seconds", "seed"), [(15.0, 1), *[pytest.param(60.0, seed, marks=pytest.mark.slow) for seed in range(2, 6)]]
+    ("seconds", "seed"), [(15.0, 1), *[pytest.param(60.0, seed, marks=LONG) for seed in range(2, 6)]]
 )
 def test_beside_a_person_it_comes_no_closer_by_itself_and_does_not_shake(name: str, seconds: float, seed: int) -> None:
     """Who walks in and out and reaches, seen at 60 Hz, 30 to 45 ms old, with noise. The speeds are the driver's: told
