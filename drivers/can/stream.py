@@ -52,6 +52,7 @@ class Stream:
         self._tap, self._tapped_ns = tap, 0
         self._newest: list[Frame | None] = [None] * n
         self._sent_ns = self._due_ns = 0
+        self._running = 1.0  # periods that the newest command acts until the next one: more where we are late
         self._was_late = self._disturbed = False  # this cycle was sent late; the one before was irregular
 
     # --- send --------------------------------------------------------------------------------------------------------
@@ -69,7 +70,7 @@ class Stream:
             self._tap("tx", now_ns, bundle(self.seq, frames))
         taken = self.link.send(frames)
         self._expect(targets)
-        self.targets, self._sent_ns = targets, now_ns
+        self.targets, self._sent_ns, self._running = targets, now_ns, 1.0
         self._was_late |= taken < len(frames)
         self.counters.cycles += 1
         return now_ns, frames, taken == len(frames)
@@ -77,7 +78,7 @@ class Stream:
     def _expect(self, targets: Sequence[Target]) -> None:
         """A torque comes with the speed that it makes of the present one until the next cycle."""
         for axis, target in zip(self.axes, targets, strict=True):
-            axis.command(target.dq - axis.dq - axis.gained if target.kind is CommandKind.TORQUE else 0.0)
+            axis.command(target.dq - axis.speed(self._running) if target.kind is CommandKind.TORQUE else 0.0)
 
     def _note_lateness(self, now_ns: int) -> None:
         behind_ns = now_ns - self._due_ns if self._due_ns else 0
@@ -105,6 +106,7 @@ class Stream:
             self._hear(frame)
         while (frame := self.link.receive(until_ns or self.link.now_ns())) is not None:
             self._hear(frame)
+        self._running = max(1.0, (self.link.now_ns() - self._sent_ns) / self.period_ns)
         self._judge()
         frames = [frame for frame in self._newest if frame is not None]
         if self._tap is not None and len(frames) == len(self.axes):
@@ -217,12 +219,14 @@ class Stream:
         """q, dq, tau of every axis now: each goes on as it told last, and as it was driven since."""
         told = [axis.feedback for axis in self.axes]
         q = [f.q + URAD * on if f else np.nan for f, on in zip(told, self._carried(), strict=True)]
-        dq = [axis.dq + axis.gained for axis in self.axes]
+        dq = [axis.speed(self._running) for axis in self.axes]
         return vector(q), vector(dq), vector([f.tau if f else np.nan for f in told])
 
     def _carried(self) -> list[int]:
         period = self.period_ns * 1e-9
-        return [axis.carried(missed, period) for axis, missed in zip(self.axes, self.missed, strict=True)]
+        return [
+            axis.carried(missed, self._running, period) for axis, missed in zip(self.axes, self.missed, strict=True)
+        ]
 
     def powers(self) -> list[Power | None]:
         return [axis.feedback.power if axis.feedback else None for axis in self.axes]

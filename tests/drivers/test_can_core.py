@@ -35,6 +35,7 @@ from sim_hil.trials.episode import Armer
 from sim_hil.trials.judge import Judge
 from sim_hil.trials.sensing import Camera, Quality
 
+LONG = (pytest.mark.slow, pytest.mark.timeout(1200))
 NOBODY = HumanState(
     0, 1, 1, 0, Health.OK, 1.0, True, *[np.zeros((0, 3))] * 4, *[np.zeros(0)] * 3, np.zeros(0, np.int64)
 )
@@ -139,6 +140,19 @@ def test_it_moves_to_a_goal_and_holds_it_under_gravity(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
+def test_an_axis_that_something_holds_is_seen_under_torque_control(name: str) -> None:
+    session = Session(name)
+    goal = Goal(1, vector(session.q0 + np.radians([60, 0, 0, 0, 0, 0, 0])))
+    session.run(20)
+    session.run(60, goal, arm=True)
+    assert session.state.mode is Mode.ACTIVE and session.rig.line.mechanics.dq[0] > 0.2
+    session.rig.strike("block", 1)
+    made = session.run(40, goal)
+    assert session.state.reason is StopReason.ROBOT_FAULTED and len(made) < 30
+    assert "axis 1: following error" in str(session.rig.driver.fault)
+
+
+@pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
 def test_a_drive_that_fails_in_motion_ends_the_session_and_the_rest_of_the_arm_stops_and_holds(name: str) -> None:
     session = Session(name)
     goal = Goal(1, vector(session.q0 + np.radians([30, 5, 0, -10, 5, 5, 5])))
@@ -155,7 +169,7 @@ def test_a_drive_that_fails_in_motion_ends_the_session_and_the_rest_of_the_arm_s
 
 @pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
 @pytest.mark.parametrize(
-    ("seconds", "seed"), [(15.0, 1), *[pytest.param(60.0, seed, marks=pytest.mark.slow) for seed in range(2, 6)]]
+    ("seconds", "seed"), [(15.0, 1), *[pytest.param(60.0, seed, marks=LONG) for seed in range(2, 6)]]
 )
 def test_beside_a_person_it_comes_no_closer_by_itself_and_does_not_shake(name: str, seconds: float, seed: int) -> None:
     """Who walks in and out and reaches, seen at 60 Hz, 30 to 45 ms old, with noise. The speeds are the driver's: told

@@ -214,6 +214,26 @@ def test_a_velocity_is_followed(enabled: dict[str, Rig], arm: str) -> None:
     np.testing.assert_allclose(rig.line.mechanics.dq, 0.3, atol=0.03)
 
 
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_arm_that_went_on_while_we_were_held_up_is_not_told_where_it_was(arm: str) -> None:
+    """The last torque goes on acting: 20 ms without us are 13 mrad of way and 0.06 rad/s here."""
+    rig = Rig(arm, stale_ms=50.0)
+    m = rig.line.mechanics
+    rig.driver.dynamics = lambda q, dq, ddq: vector(m.friction * dq + m.inertia * ddq)
+    rig.driver.configure()
+    sample: JointState | None = rig.driver.activate(rig.period_ns)
+    for k in range(61):
+        assert sample is not None
+        ddq = np.full(7, 4.0)
+        tau = rig.driver.dynamics(sample.q, sample.dq, ddq)
+        rig.driver.write(torque(sample.q, sample.dq + rig.period_ns * 1e-9 * ddq, tau))
+        rig.run(rig.period_ns if k < 60 else 20_000_000)
+        sample = rig.driver.read(rig.now_ns())
+    assert sample is not None and RobotFlag.READY in sample.flags
+    np.testing.assert_allclose(sample.q, m.q, atol=4e-3)
+    np.testing.assert_allclose(sample.dq, m.dq, atol=0.03)
+
+
 def test_an_interface_that_becomes_slow_shows_no_speed_that_is_not_there() -> None:
     """Some cycles pass without an answer, then each brings one that is as old: 4 ms lie in it, not the 16 ms between
     our cycles. These drives tell no speed: it is the difference of positions."""
