@@ -51,8 +51,8 @@ class Message:
     """One dataclass as a protobuf message. Fields: name -> Python type, Array or Message; the order numbers them.
 
     `optional`: None is a value of its own (a flag `present`). `capacity`: the arrays hold 0..capacity rows (a field
-    `count`), else n. `rows`: a tuple of 0..capacity dataclasses, written as columns. Scalars stand before
-    arrays, arrays before messages, whatever order the table has.
+    `count`), else n. `rows`: a tuple of 0..capacity dataclasses, written as columns. `kept`: often the same object in
+    the next record. Scalars stand before arrays, arrays before messages, whatever order the table has.
     """
 
     def __init__(
@@ -63,8 +63,9 @@ class Message:
         optional: bool = False,
         capacity: int = 0,
         rows: bool = False,
+        kept: bool = False,
     ) -> None:
-        self.cls, self.optional, self.capacity, self.rows = cls, optional, capacity, rows
+        self.cls, self.optional, self.capacity, self.rows, self.kept = cls, optional, capacity, rows, kept
         self.messages = {k: v for k, v in fields.items() if isinstance(v, Message)}
         self.arrays = {k: v for k, v in fields.items() if isinstance(v, Array)}
         self.scalars = {k: v for k, v in fields.items() if k not in self.messages and k not in self.arrays}
@@ -159,10 +160,18 @@ class Value:
     source: str
 
 
-Piece = bytes | Value  # bytes: tags, and values that are always the same
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A message that may be absent: the expression that finds it, and the pieces of what is found, under `name`."""
+
+    it: str
+    name: str
+    absent: bytes
+    present: list[Piece]
+
+
+Piece = bytes | Value | Choice  # bytes: tags, and values that are always the same
 Names = dict[str, Any]  # the objects that sources speak of
-
-
 MOST = 28  # arguments of one call: of more than 30 the interpreter makes a list first
 
 
@@ -170,28 +179,49 @@ def compiled(pieces: Iterable[Piece], arguments: str, names: Names) -> Callable[
     """The function of `into`, `at` and `arguments` that packs the pieces, one after the other, into memory.
 
     The record is written in every cycle, in caches that the decision has left cold: what counts is how many steps and
-    objects it takes. Therefore the calls are written out, without a tuple of their arguments (MEASURED, cold: 25 us;
-    the same with shared code for the arrays of a message 40 us); neighbours that never differ are one; a single byte
-    is a number, of which the interpreter has only one, and not a string of its own.
+    objects it takes. Therefore everything is written out, without a tuple of the values and without a call for each
+    message (MEASURED, cold: 20 us; with shared code for the arrays of a message 40 us); neighbours that never differ
+    are one; a single byte is a number, of which the interpreter has only one, and not a string of its own.
     """
-    items: list[Value] = []
+    names = {**names, "misfit": _misfit}
+    lines = [f"def pack(into, at, {arguments}):", *_lines(pieces, 0, names)[0]]
+    exec("\n    ".join(lines), names)
+    made: Callable[..., None] = names["pack"]
+    return made
+
+
+def _lines(pieces: Iterable[Piece], offset: int, names: Names) -> tuple[list[str], int]:
+    """Statements that pack the pieces at `offset`, and where they end. `names` receives the functions called."""
+    lines: list[str] = []
+    for is_choice, group in itertools.groupby(pieces, lambda piece: isinstance(piece, Choice)):
+        if not is_choice:
+            values = list(_joined(group))
+            for first in range(0, len(values), MOST):
+                line, offset = _call(values[first : first + MOST], offset, names)
+                lines.append(line)
+            continue
+        for choice in (piece for piece in group if isinstance(piece, Choice)):
+            without, _ = _call([Value(f"{len(choice.absent)}s", repr(choice.absent))], offset, names)
+            inner, offset = _lines(choice.present, offset, names)
+            lines += [f"{choice.name} = {choice.it}", f"if {choice.name} is None:", f"    {without}", "else:"]
+            lines += [f"    {line}" for line in inner]
+    return lines, offset
+
+
+def _joined(pieces: Iterable[Piece]) -> Iterator[Value]:
     for constant, group in itertools.groupby(pieces, lambda piece: isinstance(piece, bytes)):
         if constant:
             joined = b"".join(piece for piece in group if isinstance(piece, bytes))
-            items.append(Value("B", f"{joined[0]}") if len(joined) == 1 else Value(f"{len(joined)}s", repr(joined)))
+            yield Value("B", f"{joined[0]}") if len(joined) == 1 else Value(f"{len(joined)}s", repr(joined))
         else:
-            items += [piece for piece in group if isinstance(piece, Value)]
-    lines, offset, names = [f"def pack(into, at, {arguments}):"], 0, {**names, "misfit": _misfit}
-    for first in range(0, len(items), MOST):
-        some = items[first : first + MOST]
-        layout = struct.Struct("<" + "".join(value.code for value in some))
-        names[f"pack_{first}"] = layout.pack_into
-        place = f"at + {offset}" if offset else "at"
-        lines.append(f"    pack_{first}(into, {place}, {', '.join(value.source for value in some)})")
-        offset += layout.size
-    exec("\n".join(lines), names)
-    made: Callable[..., None] = names["pack"]
-    return made
+            yield from (piece for piece in group if isinstance(piece, Value))
+
+
+def _call(values: list[Value], offset: int, names: Names) -> tuple[str, int]:
+    layout, name = struct.Struct("<" + "".join(value.code for value in values)), f"pack_{len(names)}"
+    names[name] = layout.pack_into
+    place = f"at + {offset}" if offset else "at"
+    return f"{name}(into, {place}, {', '.join(value.source for value in values)})", offset + layout.size
 
 
 def _pieces(message: Message, n: int, path: str, it: str, leaves: Iterator[Leaf], names: Names) -> Iterator[Piece]:
@@ -217,20 +247,28 @@ def _pieces(message: Message, n: int, path: str, it: str, leaves: Iterator[Leaf]
     for name, inner in message.messages.items():
         inner_path, inner_it = f"{path}.{name}", f"{it}.{name}"
         if inner.optional or inner.rows:
-            yield _alone(inner, n, inner_path, inner_it, list(itertools.islice(leaves, inner.leaf_count)), names)
+            yield _choice(inner, n, inner_path, inner_it, list(itertools.islice(leaves, inner.leaf_count)), names)
         else:
             yield from _pieces(inner, n, inner_path, inner_it, leaves, names)
 
 
-def _alone(message: Message, n: int, path: str, it: str, leaves: list[Leaf], names: Names) -> Value:
-    """A message that may be absent is packed on its own; and, as nothing in it can change, only when it is another
-    object than the last time: people are seen less often than the loop goes round."""
-    absent = b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)
+def _choice(message: Message, n: int, path: str, it: str, leaves: list[Leaf], names: Names) -> Piece:
+    """The piece of a message that may be absent."""
+    name, absent = path.replace(".", "_"), b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)
+    if not (message.kept or message.rows):
+        return Choice(it, name, absent, list(_pieces(message, n, path, name, iter(leaves), names)))
     if message.rows:
         pack = _rows(message, path, leaves)
     else:
         own: Names = {}
         pack = compiled(list(_pieces(message, n, path, "it", iter(leaves), own)), "it", own)
+    names[name] = _kept(pack, absent)
+    return Value(f"{len(absent)}s", f"{name}({it})")
+
+
+def _kept(pack: Callable[..., None], absent: bytes) -> Callable[[Any], bytearray]:
+    """The bytes of a message; as nothing in it can change, it is packed only when it is another object than the last
+    time."""
     made, unknown = bytearray(absent), object()
     last: Any = None
 
@@ -245,9 +283,7 @@ def _alone(message: Message, n: int, path: str, it: str, leaves: list[Leaf], nam
             last = obj
         return made
 
-    name = f"pack_{path.replace('.', '_')}"
-    names[name] = data
-    return Value(f"{len(absent)}s", f"{name}({it})")
+    return data
 
 
 def _rows(message: Message, path: str, leaves: list[Leaf]) -> Callable[..., None]:
@@ -330,7 +366,7 @@ class Part:
             offset += leaf.size
         self.names: Names = {}
         if message.optional:
-            self.pieces: list[Piece] = [_alone(message, n, name, name, leaves, self.names)]
+            self.pieces: list[Piece] = [_choice(message, n, name, name, leaves, self.names)]
         else:
             self.pieces = list(_pieces(message, n, name, name, iter(leaves), self.names))
         self._pack_into = compiled(self.pieces, name, self.names)

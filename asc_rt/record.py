@@ -108,6 +108,7 @@ HUMAN = Message(
     },
     optional=True,
     capacity=MAX_CAPSULES,
+    kept=True,  # people are seen less often than the loop goes round
 )  # fmt: skip
 EVENT = {"id": INDICES, "kind": Array("<i8", kind=EventKind), "tool": INDICES}
 SENSOR = {
@@ -119,7 +120,7 @@ INPUTS = Message(
     CycleInputs,
     {
         "tick": int, "t_ns": int, "period_ns": int, "human_age_ns": int, "missed_ticks": int,
-        "late": bool, "joint": JOINT, "human": HUMAN, "goal": Message(Goal, GOAL, optional=True),
+        "late": bool, "joint": JOINT, "human": HUMAN, "goal": Message(Goal, GOAL, optional=True, kept=True),
         "events": Message(OperatorEvent, EVENT, capacity=MAX_EVENTS, rows=True),
         "sensors": Message(SensorReport, SENSOR, capacity=MAX_SENSORS, rows=True),
     },
@@ -155,7 +156,11 @@ COMMAND = Message(
 )
 OUTPUTS = Message(
     CycleOutputs,
-    {"decision": DECISION, "command": COMMAND, "stop": Message(StopRequest, {"reason": StopReason}, optional=True)},
+    {
+        "decision": DECISION,
+        "command": COMMAND,
+        "stop": Message(StopRequest, {"reason": StopReason}, optional=True, kept=True),
+    },
 )
 RECEIPT = Message(WriteReceipt, {"t_tx_ns": int, "seq": int, "ok": bool, "q": JOINTS}, optional=True)
 TIMINGS = Message(Timings, {"t_wake_ns": int, "t_read_ns": int, "t_step_end_ns": int, "t_write_end_ns": int})

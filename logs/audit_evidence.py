@@ -90,15 +90,15 @@ def gather(path: str | Path, progress: Progress = iter) -> Evidence:
     harvest = _Harvest()
     log = open_recording(path, harvest, progress)
     harvest.condense(log.layout)  # the rest
-    columns = {name: np.concatenate([part[name] for part in harvest.parts]) for name in harvest.parts[0]}
-    return Evidence(log, columns, harvest.broken, (harvest.packets["rx"], harvest.packets["tx"]))
+    return Evidence(log, harvest.columns(), harvest.broken, (harvest.packets["rx"], harvest.packets["tx"]))
 
 
 class _Harvest:
     """A `Visitor` that keeps columns of the cycles, and the packets."""
 
     def __init__(self) -> None:
-        self.parts: list[dict[str, Column]] = []
+        self._columns: dict[str, Column] = {}
+        self._count = 0  # cycles in them; behind it they have room
         self.packets: dict[str, dict[int, bytes]] = {"rx": {}, "tx": {}}
         self.broken = 0  # records whose own checksum is wrong
         self._waiting: list[bytes] = []
@@ -119,7 +119,22 @@ class _Harvest:
         """Keep the columns of the records that wait."""
         block = np.frombuffer(b"".join(self._waiting), layout.dtype)
         self._waiting = []
-        self.parts.append({path: block[path].copy() for path in _COLUMNS} | _derived(block))
+        first, self._count = self._count, self._count + len(block)
+        for path, values in ({path: block[path] for path in _COLUMNS} | _derived(block)).items():
+            column = self._columns.setdefault(path, np.empty((0, *values.shape[1:]), values.dtype))
+            if len(column) < self._count:
+                _resize(column, self._count + self._count // 4)
+            column[first : self._count] = values
+
+    def columns(self) -> dict[str, Column]:
+        for column in self._columns.values():
+            _resize(column, self._count)
+        return self._columns
+
+
+def _resize(column: Column, length: int) -> None:
+    """In place: pieces that are joined at the end would be in memory twice."""
+    column.resize((length, *column.shape[1:]), refcheck=False)
 
 
 def _derived(batch: Records) -> dict[str, Column]:

@@ -169,6 +169,7 @@ class Log:
 
     def _scan(self, progress: Progress) -> None:
         data, name, sha, hashed = self.data, self._name, hashlib.sha256(), 0
+        view = memoryview(data)  # without seals all of it is hashed at once: not copied for that
         left = iter(progress(range(len(data) // MEGABYTE)))
         done = 0
         for raw in mcap_scan.frames(data, name, self.extent):
@@ -178,7 +179,7 @@ class Log:
                 attachment = mcap_scan.parse(Attachment, data, name, raw)
                 self.attachments[attachment.name] = attachment.data
             elif raw.op == _METADATA:
-                sha.update(data[hashed : raw.start])
+                sha.update(view[hashed : raw.start])
                 hashed = raw.start
                 metadata = mcap_scan.parse(Metadata, data, name, raw)
                 self._meet_metadata(metadata, raw.start, sha.hexdigest())
