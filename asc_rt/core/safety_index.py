@@ -100,7 +100,7 @@ def index_of(safety: SafetyParams, at_once: bool = False) -> Index:
 def unpack(packed: Vector) -> Index:
     """An Index from its numbers in one array, which is how Python hands it to a kernel fastest."""
     x = packed
-    return Index(int(x[0]), x[1], x[2], x[3], x[4], x[5], x[6], x[7] > 0.0)
+    return Index(int(x[0]), x[1], x[2], x[3], x[4], x[5], x[6], bool(x[7]))
 
 
 @njit(cache=True)

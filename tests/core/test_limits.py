@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ruckig
 
-from asc_rt.core.limits import Bounds, acceleration_box, command_box
+from asc_rt.core.limits import Bounds, acceleration_box, command_box, reserve
 from asc_rt.core.stopping import stopping_distance
 
 
@@ -139,6 +139,21 @@ def test_no_control_in_the_box_ever_breaks_a_limit(bench: Any, robot: str, at_on
             )
             assert np.all(q + stop <= b.q_max + 1e-6) and np.all(q - back >= b.q_min - 1e-6)
     assert reached > 0.9  # the adversary did get to a limit
+
+
+def test_the_last_acceleration_plays_no_part_where_the_next_acts_at_once() -> None:
+    """On its way to the speed limit, and to the end of the range, in closed form."""
+    A, J, v, room, T = 8.0, 300.0, 2.0, 0.6, 0.008
+    b = Bounds(*(np.array([x]) for x in (-room, room, v, A, J)))
+    for ddq in (-2.0, 0.0, 2.0):
+        _, upper = command_box(b, np.zeros(1), np.array([1.96]), np.array([ddq]), T, True)
+        u = np.sqrt((J * T) ** 2 + 2.0 * J * (v - 1.96)) - J * T  # dq + T u + u^2 / 2J = dq_max
+        assert upper[0] == pytest.approx(min(u, ddq + J * T))
+        for u in (-0.3, 0.3):
+            speed = 1.2 + T * u
+            q = room - reserve(v, A, J, T) - stopping_distance(speed, u, A, J) - T * 1.2 - T * T * u / 2.0
+            _, upper = command_box(b, np.array([q]), np.array([1.2]), np.array([ddq]), T, True)
+            assert upper[0] == pytest.approx(u, abs=1e-6)
 
 
 def test_the_box_reaches_the_jerk_and_acceleration_limits_far_from_every_other(bench: Any) -> None:

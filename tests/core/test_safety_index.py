@@ -129,16 +129,17 @@ def test_of_what_acts_at_once_the_last_control_plays_no_part(v: float, a: float,
 
 
 @settings(max_examples=300, deadline=None)
-@given(state=states, system=systems)
-def test_greatest_approach_is_the_edge_of_what_keeps_the_row(state: Any, system: Any) -> None:
+@given(state=states, system=systems, at_once=st.booleans())
+def test_greatest_approach_is_the_edge_of_what_keeps_the_row(state: Any, system: Any, at_once: bool) -> None:
     d, v, a = state
     M, M_dot, J, k = system
     most = M + abs(a) + 100.0
-    u = min(most, greatest_approach(d, v, a, T, M, M_dot, J, index(k), most))
+    u = min(most, greatest_approach(d, v, a, T, M, M_dot, J, index(k)._replace(at_once=at_once), most))
 
     def after(control: float) -> float:
-        d_after = d - T * v - T * T * (2.0 * a + control) / 6.0
-        return psi(d_after, v + T * (a + control) / 2.0, control, M + T * min(0.0, M_dot), M_dot, J, index(k))
+        begin = control if at_once else a
+        d_after = d - T * v - T * T * (2.0 * begin + control) / 6.0
+        return psi(d_after, v + T * (begin + control) / 2.0, control, M + T * min(0.0, M_dot), M_dot, J, index(k))
 
     target = max(0.0, psi(d, v, a, M, M_dot, J, index(k)) * (1.0 - ETA * T))
     slack = 1e-4 * (1.0 + target)
