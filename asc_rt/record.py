@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from google.protobuf import descriptor_pb2
@@ -70,8 +70,10 @@ from drivers.base import WriteReceipt
 NAME = f"{PACKAGE}.CycleRecord"
 
 
-class Timings(NamedTuple):
-    """Monotonic ns of this cycle, for the report only: nothing that is replayed depends on them."""
+@dataclass(slots=True)
+class Timings:
+    """Monotonic ns of this cycle, for the report only: nothing that is replayed depends on them. Not frozen: that would
+    take longer to make, and it is made in every cycle."""
 
     t_wake_ns: int  # the loop is running again: sample received, or deadline reached
     t_read_ns: int  # inputs frozen
