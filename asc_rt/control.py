@@ -29,7 +29,8 @@ from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs, Mode, StopRe
 from asc_rt.core.warm import warm_up
 from asc_rt.cycle import run
 from asc_rt.inputs import Mail
-from asc_rt.record import RecordError, RecordLayout, Timings
+from asc_rt.packing import RecordError
+from asc_rt.record import RecordLayout, Timings
 from asc_rt.ring import RingError, RingWriter, wire_path, wire_tap
 from asc_rt.robot_limits import within
 from drivers import registry

@@ -57,14 +57,13 @@ from asc_rt.fixed_protobuf import (
     Leaf,
     Message,
     Part,
-    RecordError,
     Unsigned,
     add_field,
-    compiled,
     describe,
     tag,
 )
 from asc_rt.inputs import MAX_EVENTS
+from asc_rt.packing import RecordError, compiled
 from drivers.base import WriteReceipt
 
 NAME = f"{PACKAGE}.CycleRecord"

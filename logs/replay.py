@@ -21,7 +21,7 @@ import numpy as np
 from asc_rt.core.params import Params
 from asc_rt.core.types import CoreState, CycleInputs, CycleOutputs
 from asc_rt.fingerprint import fingerprint
-from asc_rt.fixed_protobuf import RecordError
+from asc_rt.packing import RecordError
 from logs.diff import Difference, altered, differences
 from logs.reader import Progress
 from logs.recording import Recording, open_recording

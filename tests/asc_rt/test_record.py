@@ -19,7 +19,8 @@ from asc_rt.core.types import (
     OperatorEvent,
     RobotFlag,
 )
-from asc_rt.fixed_protobuf import Array, Message, RecordError
+from asc_rt.fixed_protobuf import Array, Message
+from asc_rt.packing import RecordError
 from asc_rt.record import MAX_EVENTS, RecordLayout
 from drivers.base import WriteReceipt
 
