@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -18,17 +17,12 @@ from asc_rt.bus import Bus, BusError, Keys, Latest, Remote, open_client, open_ro
 from asc_rt.human_codec import clock_id
 from tests import other_machine as other
 from tests.other_machine import HERE
+from tests.ports import free_port
 
 pytestmark = pytest.mark.real_time
 
 AHEAD_S = 5_000  # of the other machine's clock
 SENSOR = "side"
-
-
-def free_port(host: str = "127.0.0.1") -> int:
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
 
 
 def heard(box: Latest, seconds: float = 5.0) -> bytes | None:

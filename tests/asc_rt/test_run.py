@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from tests.ports import free_port
+
 ROOT = Path(__file__).parents[2]
 PATIENCE = 240  # s; only what hangs takes so long
 ASC = [sys.executable, "-m", "asc_rt"]
@@ -27,20 +29,13 @@ KEYS = {
 pytestmark = pytest.mark.real_time
 
 
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 class Run:
     """A running `asc run --json` on ports of its own."""
 
     def __init__(self, folder: Path, duration: float, port: int | None = None) -> None:
         self.log = folder / "log.mcap"
-        self.port = port or free_port(socket.SOCK_DGRAM)
-        bus = free_port(socket.SOCK_STREAM)
+        self.port = port or free_port(kind=socket.SOCK_DGRAM)
+        bus = free_port()
         settings = [f"driver.port={self.port}", f"bus.endpoint=tcp/127.0.0.1:{bus}", "human.age_limit_ms=900"]
         command = [*ASC, "run", "--json", "--duration", str(duration), "--log", str(self.log)]
         for setting in settings:

@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import resource
-import socket
 import subprocess
 import sys
 import time
@@ -27,6 +26,7 @@ from logs.recording import open_recording
 from logs.recover import recover
 from logs.session_files import SessionFiles, manifest_path, part_path
 from logs.writer import FLUSH_NS, Logger
+from tests.ports import free_port
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 ROOT = Path(__file__).parents[2]
@@ -263,7 +263,7 @@ def test_the_policy_decides_whether_the_logger_stays(recording: Any, tmp_path: P
     path, out = tmp_path / "ring", tmp_path / "a.mcap"
     ring.create(path, recording.layout.size, 50_000)
     ring.create(ring.wire_path(path), 600, 10)
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [
         sys.executable, "-m", "logs.writer", "--cell", "fanuc-sim", "--ring", str(path), "--out", str(out),
         "--set", f"bus.endpoint={endpoint}", "--set", f"log.on_full={policy}",
@@ -295,9 +295,3 @@ def test_the_policy_decides_whether_the_logger_stays(recording: Any, tmp_path: P
     assert errors.count("\n") == 1
     assert out.stat().st_size <= limit
     assert open_log(out).cycles > 0
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ from logs.context import attachments, session
 from logs.reader import open_log
 from logs.session_files import SessionFiles
 from logs.writer import FLUSH_NS, Logger, joints_message, state_message
+from tests.ports import free_port
 
 
 class Clock:
@@ -151,12 +151,6 @@ def test_the_joints_message_is_every_sample_of_the_cycles(recording: Any) -> Non
 # --- the process -----------------------------------------------------------------------------------------------------
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def start(path: Path, out: Path, *options: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "logs.writer", "--cell", "fanuc-sim", "--ring", str(path), "--out", str(out)]
     return subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
@@ -173,7 +167,7 @@ def wait_until(condition: Any) -> None:
 @pytest.mark.real_time
 @pytest.mark.parametrize("ending", ["closed", "terminated"])
 def test_the_process_records_a_session(recording: Any, session_ring: Path, tmp_path: Path, ending: str) -> None:
-    packed, out, endpoint = recording.packed(recording.cycles(40)), tmp_path / "a.mcap", free_endpoint()
+    packed, out, endpoint = recording.packed(recording.cycles(40)), tmp_path / "a.mcap", f"tcp/127.0.0.1:{free_port()}"
     human = HumanState(seq=7).SerializeToString()
     with open_router(endpoint) as bus, ring.RingWriter(session_ring) as cycles:
         state = bus.queue(topics.STATE.key)

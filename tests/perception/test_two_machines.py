@@ -25,6 +25,7 @@ from asc_rt.core.types import Mode
 from logs.recording import open_recording
 from tests import other_machine
 from tests.other_machine import HERE
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 ASC = [sys.executable, "-m", "asc_rt"]
@@ -32,16 +33,6 @@ PATIENCE_S = 240
 AHEAD_S = 5_000  # of the other machine's clock
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time, pytest.mark.timeout(600)]
-
-
-def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_STREAM) -> list[int]:
-    probes = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
-    for probe in probes:
-        probe.bind((HERE, 0))
-    ports = [int(probe.getsockname()[1]) for probe in probes]
-    for probe in probes:
-        probe.close()
-    return ports
 
 
 @pytest.fixture
@@ -54,8 +45,8 @@ def machine() -> Iterator[str]:
 def cell(machine: str, tmp_path: Path) -> Path:
     """fanuc-sim-seeing whose [perception] is on the other machine; its cameras listen on the link between the two."""
     text = (CELLS / "fanuc-sim-seeing.toml").read_text()
-    bus, door, left, right = free_ports(4)
-    (robot,) = free_ports(1, socket.SOCK_DGRAM)
+    bus, door, left, right = (free_port(HERE) for _ in range(4))
+    robot = free_port(kind=socket.SOCK_DGRAM)
     changes = {
         r"port = 60015": f"port = {robot}",
         r"17447\"": f'{bus}"\n\n[bus.remote]\nendpoint = "tls/{HERE}:{door}"\nkeys = "keys"',

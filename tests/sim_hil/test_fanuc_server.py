@@ -17,15 +17,14 @@ import pytest
 from asc_rt.config import CELLS
 from drivers.fanuc_stream_motion.link import StreamMotion
 from sim_hil.fanuc import wire
+from tests.ports import free_port
 
 pytestmark = pytest.mark.real_time
 
 
 @pytest.fixture
 def port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    return free_port(kind=socket.SOCK_DGRAM)
 
 
 @pytest.fixture

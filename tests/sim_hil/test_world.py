@@ -3,7 +3,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import socket
 import subprocess
 import sys
 import threading
@@ -28,6 +27,7 @@ from sim_hil.human import HumanOptions, HumanSource, Rhythm, body, clock_id, pub
 from sim_hil.person import Capsules, Person
 from sim_hil.plant import MujocoPlant
 from sim_hil.world import LONGEST_EXTRAPOLATION, World, decode, extrapolate
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 READY = np.radians([0, 20, 0, 0, -80, 0])
@@ -41,9 +41,7 @@ class Cell:
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture
