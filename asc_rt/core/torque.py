@@ -17,26 +17,28 @@ from asc_rt.core.system import System
 from asc_rt.core.types import CoreState, CycleInputs, Matrix, StopReason, Vector, frozen
 
 REST_SPEED = 0.01  # ASSUMED, rad/s: slower than this the arm is held where it is
-# ASSUMED: reference towards a goal, 1/s: speed per distance and acceleration per speed error. Critically damped at 4:1.
-GOAL_RATE = 3.0
-SPEED_RATE = 12.0
-# ASSUMED: holding a pose, 1/s2 and 1/s. A model error of 1 rad/s2 moves the arm by 1 / HOLD_STIFFNESS rad.
-HOLD_STIFFNESS = 900.0
-HOLD_DAMPING = 60.0
+# ASSUMED, 1/s: speed per distance and acceleration per speed error, critically damped at 1:4. On the way to a goal, and
+# where the arm is held: there a model error, or rounding of the torques, of 1 rad/s2 leaves it 1 / 900 rad off, on the
+# way 1 / 36.
+ON_THE_WAY = (3.0, 12.0)
+HELD = (15.0, 60.0)
 
 
 def reference(system: System, state: CoreState) -> Vector:
-    """u = SPEED_RATE (dq_ref - dq), dq_ref = GOAL_RATE (q_goal - q), all joints slowed alike to the task's speed."""
+    """u = b (dq_ref - dq), dq_ref = a (q_goal - q), all joints slowed alike to the task's speed. A goal that has been
+    reached is held, at the speed with which the arm came into its tolerance."""
     task = system.params.task
+    if state.reached_id == state.goal.id and np.all(np.abs(state.goal.q - state.q_cmd) <= task.goal_tolerance):
+        creep = np.full(system.n, ON_THE_WAY[0] * task.goal_tolerance)
+        return frozen(_towards(state.goal.q, state.q_cmd, state.dq_cmd, creep, *HELD))
     speed = task.speed if state.slow is StopReason.NONE else min(task.speed, task.slow_speed)
-    fastest = speed * system.bounds.dq_max
-    return frozen(_towards(state.goal.q, state.q_cmd, state.dq_cmd, fastest))
+    return frozen(_towards(state.goal.q, state.q_cmd, state.dq_cmd, speed * system.bounds.dq_max, *ON_THE_WAY))
 
 
 @njit(cache=True)
-def _towards(goal: Vector, q: Vector, dq: Vector, fastest: Vector) -> Vector:
-    wish = GOAL_RATE * (goal - q)
-    return SPEED_RATE * (wish / max(1.0, np.max(np.abs(wish) / fastest)) - dq)
+def _towards(goal: Vector, q: Vector, dq: Vector, fastest: Vector, a: float, b: float) -> Vector:
+    wish = a * (goal - q)
+    return b * (wish / max(1.0, np.max(np.abs(wish) / fastest)) - dq)
 
 
 def stop(system: System, state: CoreState, x: CycleInputs) -> SetPoint:
@@ -46,8 +48,7 @@ def stop(system: System, state: CoreState, x: CycleInputs) -> SetPoint:
     """
     b, T = system.bounds, system.params.period
     q, dq = (x.joint.q, x.joint.dq) if x.joint is not None else (state.q_cmd, state.dq_cmd)
-    hold = HOLD_STIFFNESS * (state.q_cmd - q) - HOLD_DAMPING * dq
-    wish = hold if at_rest(state) else -dq / (4.0 * T)
+    wish = _towards(state.q_cmd, q, dq, b.dq_max, *HELD) if at_rest(state) else -dq / (4.0 * T)
     U = _brakes(system.model.packed, q, dq)
     u = project(np.clip(wish, -b.ddq_max, b.ddq_max), U, b.ddq_max)
     if u is None:

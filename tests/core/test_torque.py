@@ -92,3 +92,31 @@ def test_held_off_by_a_person_it_stands_still(name: str) -> None:
     assert state.mode is Mode.ACTIVE and out.command is not None
     assert max(closing) < APPROACH
     assert max(changes) < 1.0, "rad/s2 from one cycle to the next"
+
+
+@pytest.mark.parametrize("name", ["panda-torque-sim", "openarm-sim"])
+def test_a_goal_that_was_reached_is_held_stiffly(name: str) -> None:
+    """Torques that are off by as much as 0.5 rad/s2 in each joint: the arm stays within 1 mrad of where it is sent."""
+    cell = load_cell(name)
+    system = System(cell.params)
+    T, n, p = system.params.period, system.n, system.params
+    q, dq, state = np.radians(cell.sim["can"]["start_deg"]), np.zeros(n), initial(system)
+    goal, off, fastest = Goal(1, vector(q + 0.1)), 0.5, []
+    flags = RobotFlag.READY | RobotFlag.SERVO_ON
+    for k in range(round(4.0 / T)):
+        now = k * p.period_ns
+        human = dataclasses.replace(SEEN, t_capture_ns=now, seq=k)
+        events = (OperatorEvent(1, EventKind.ARM),) if k == 2 else ()
+        joint = JointState(now, 0, k, vector(q), vector(dq), system.zero, flags, 0, True)
+        x = CycleInputs(k, now, p.period_ns, joint, human, 0, heard(human, 0), goal, events, 0, False)
+        was_held = state.reached_id == 1
+        state, _ = step(system, state, x)
+        if k == round(3.0 / T):
+            assert was_held
+            off = -off  # what was held stiffly against one side now is pushed to the other
+        u = state.ddq_cmd + (off if was_held else 0.0)
+        q, dq = q + T * dq + T * T * u / 2.0, dq + T * u
+        fastest.append(float(np.max(np.abs(dq))) if was_held else 0.0)
+    assert state.mode is Mode.ACTIVE
+    assert np.max(np.abs(q - goal.q)) < 1e-3
+    assert max(fastest) < 3.0 * p.task.goal_tolerance + 0.02, "rad/s, where it only had to stay"
