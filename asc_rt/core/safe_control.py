@@ -9,7 +9,8 @@ base (`safety_index`) is about what the commanded acceleration gives already, so
 braking was possible; it is recorded. Rows of the index that cannot be kept have no share and no slack, and base is kept
 by all: INFEASIBLE, and the robot brakes.
 
-PIQP, set up afresh each cycle: a reused solver carries its history and does not replay to the bit. Limits are by
+One row that binds, the usual case, has its exact answer in closed form (`_of_one_row`, a few us); everything else is
+PIQP's, set up afresh each cycle: a reused solver carries its history and does not replay to the bit. Limits are by
 iteration, never by time.
 """
 
@@ -147,17 +148,63 @@ def _quadratic(
     scale: Vector,
     shared: bool,
 ) -> _Found:
-    """One PIQP call in u / scale, with the share as one more variable if `shared`."""
-    n, solver = len(u_ref), piqp.DenseSolver()
+    """The program in u / scale, with the share as one more variable if `shared`, and its answer."""
+    n, program = len(u_ref), _program(u_ref, C, floor, base, binding, U, scale, shared)
+    P, c, G, low, high, lower, upper = program
+    if len(low) == 1 and high[0] == np.inf:
+        x, solved = _of_one_row(P, c, G, low, lower, upper)
+        iterations = 0
+    else:
+        x, solved, iterations = _of_piqp(*program)
+    share = float(min(1.0, max(0.0, x[n]))) - SOLVER_MARGIN if shared else 1.0
+    return _Found(x[:n] * scale, share, solved, iterations)
+
+
+def _of_piqp(
+    P: Matrix, c: Vector, G: Matrix, low: Vector, high: Vector, lower: Vector, upper: Vector
+) -> tuple[Vector, bool, int]:
+    solver = piqp.DenseSolver()
     settings = solver.settings
     settings.max_iter, settings.eps_abs, settings.eps_rel = MAX_ITERATIONS, TOLERANCE, TOLERANCE
-    P, c, G, low, high, lower, upper = _program(u_ref, C, floor, base, binding, U, scale, shared)
     solver.setup(P, c, None, None, G, low, high, lower, upper)
     solved = solver.solve() == piqp.PIQP_SOLVED
-    result = solver.result
-    x = result.x
-    share = float(min(1.0, max(0.0, x[n]))) - SOLVER_MARGIN if shared else 1.0
-    return _Found(x[:n] * scale, share, solved, int(result.info.iter))
+    return solver.result.x, solved, int(solver.result.info.iter)
+
+
+@njit(cache=True)
+def _of_one_row(P: Matrix, c: Vector, G: Matrix, low: Vector, lower: Vector, upper: Vector) -> tuple[Vector, bool]:
+    """min x P x / 2 + c x,  g x >= low,  lower <= x <= upper, with a diagonal P; and whether that is possible.
+
+    By the conditions of Karush, Kuhn and Tucker x(y) = clip((y g - c) / P, lower, upper) with the least multiplier
+    y >= 0 at which the row is kept. g x(y) never falls, and is straight between the y at which a component meets an end
+    of its range: the answer lies between the last of them that breaks the row and the first that keeps it.
+    """
+    g, n, keeps, breaks = G[0], c.shape[0], np.inf, 0.0
+    x = _with_multiplier(0.0, P, c, g, lower, upper)
+    if _dot(g, x) >= low[0]:
+        return x, True
+    for j in range(n):
+        for end in (lower[j], upper[j]):
+            y = (P[j, j] * end + c[j]) / g[j] if g[j] != 0.0 else 0.0
+            if breaks < y < keeps:
+                if _dot(g, _with_multiplier(y, P, c, g, lower, upper)) >= low[0]:
+                    keeps = y
+                else:
+                    breaks = y
+    if keeps == np.inf:
+        return x, False
+    first = _with_multiplier(breaks, P, c, g, lower, upper)
+    last = _with_multiplier(keeps, P, c, g, lower, upper)
+    share = (low[0] - _dot(g, first)) / (_dot(g, last) - _dot(g, first))
+    return first + share * (last - first), True
+
+
+@njit(cache=True)
+def _with_multiplier(y: float, P: Matrix, c: Vector, g: Vector, lower: Vector, upper: Vector) -> Vector:
+    x = np.empty(c.shape[0])
+    for j in range(c.shape[0]):
+        x[j] = min(max((y * g[j] - c[j]) / P[j, j], lower[j]), upper[j])
+    return x
 
 
 @njit(cache=True)
@@ -208,3 +255,12 @@ def _program(
         for j in range(n):
             G[p + i, j] = U.G[r, j] * scale[j]
     return P, c, G, low, high, lower, upper
+
+
+@njit(cache=True)
+def _dot(a: Vector, b: Vector) -> float:
+    """Summed in this order on every machine, which a library of linear algebra does not promise."""
+    value = 0.0
+    for j in range(a.shape[0]):
+        value += a[j] * b[j]
+    return value

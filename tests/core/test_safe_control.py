@@ -190,3 +190,30 @@ def test_a_row_without_a_finite_floor_is_not_solved(wrong: float) -> None:
     floor = np.array([-9.0, wrong])
     found = solve(np.zeros(6), np.array([ROW, OTHER]), floor, floor, pack(box(-FREE, FREE)), SCALE)
     assert not found.feasible and found.filtered and found.share == 0.0
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_one_row_in_closed_form_is_what_piqp_says(shared: bool) -> None:
+    """Also with a share, with bounds that the reference is outside of, and with joints that the row does not feel."""
+    rng, solved = np.random.default_rng(4), 0
+    for u_ref, C, floor, lower, upper in problems(600, seed=3, rows=1):
+        C[0, rng.random(6) < 0.3] = 0.0
+        reference = u_ref * rng.choice((0.2, 3.0))
+        base = floor - rng.uniform(0.0, 20.0)
+        program = safe_control._program(
+            reference, C, floor, base, np.zeros(1, np.int64), pack(box(lower, upper)), SCALE, shared
+        )
+        P, c, G, low, _, least, most = program
+        x, is_solved = safe_control._of_one_row(P, c, G, low, least, most)
+        y, is_piqps, _ = safe_control._of_piqp(*program)
+        room = float(np.maximum(G[0] * least, G[0] * most).sum() - low[0])
+        if abs(room) < 1e-4:
+            continue
+        assert is_solved == is_piqps == (room > 0.0)
+        if is_solved:
+            solved += 1
+            assert np.all((least <= x) & (x <= most)) and G[0] @ x >= low[0] - 1e-9
+            np.testing.assert_allclose(x, y, atol=1e-3)  # as exact as PIQP is; the cost says which is better
+            cost, other = (float(0.5 * v @ P @ v + c @ v) for v in (x, y))
+            assert cost <= other + 1e-6 * max(1.0, abs(other))
+    assert solved > 200
