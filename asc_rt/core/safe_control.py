@@ -51,7 +51,7 @@ def solve(u_ref: Vector, C: Matrix, floor: Vector, base: Vector, U: Matrix, scal
     if fits:
         return Solution(u_ref, boxed, True, False, 0, 1.0)
     found = _quadratic(u_ref, C, floor, floor, binding, U, scale, False)
-    iterations, share = found.iterations, 1.0
+    iterations, share = found.iterations, found.share
     if not found.solved and graded:
         found = _quadratic(u_ref, C, floor, base, binding, U, scale, True)
         iterations, share = iterations + found.iterations, found.share
@@ -76,10 +76,7 @@ def _screen(
     The reference is a wish; the limits are in the QP as well. Rows that no control in the box can violate do not bind:
     they are left out, exactly.
     """
-    U, n = unpack(packed), u_ref.shape[0]
-    boxed = np.empty(n)
-    for j in range(n):
-        boxed[j] = min(max(u_ref[j], U.lower[j]), U.upper[j])
+    U, n, boxed = unpack(packed), u_ref.shape[0], _boxed(u_ref, packed)
     fits, sound, graded = inside(boxed, packed), True, False
     binding, count = np.empty(floor.shape[0], np.int64), 0
     for i in range(floor.shape[0]):
@@ -94,6 +91,15 @@ def _screen(
             count += 1
             graded = graded or floor[i] > base[i]
     return boxed, fits, sound, graded, binding[:count]
+
+
+@njit(cache=True)
+def _boxed(u: Vector, packed: Matrix) -> Vector:
+    U, n = unpack(packed), u.shape[0]
+    boxed = np.empty(n)
+    for j in range(n):
+        boxed[j] = min(max(u[j], U.lower[j]), U.upper[j])
+    return boxed
 
 
 @njit(cache=True)
@@ -156,8 +162,8 @@ def _quadratic(
         iterations = 0
     else:
         x, solved, iterations = _of_piqp(*program)
-    share = float(min(1.0, max(0.0, x[n]))) - SOLVER_MARGIN if shared else 1.0
-    return _Found(x[:n] * scale, share, solved, iterations)
+    share = max(0.0, float(x[n]) - SOLVER_MARGIN) if shared else 1.0
+    return _Found(_boxed(x[:n] * scale, U), share, solved, iterations)  # a joint may have no width for rounding
 
 
 def _of_piqp(
@@ -184,8 +190,10 @@ def _of_one_row(P: Matrix, c: Vector, G: Matrix, low: Vector, lower: Vector, upp
     if _dot(g, x) >= low[0]:
         return x, True
     for j in range(n):
+        if g[j] == 0.0:
+            continue
         for end in (lower[j], upper[j]):
-            y = (P[j, j] * end + c[j]) / g[j] if g[j] != 0.0 else 0.0
+            y = (P[j, j] * end + c[j]) / g[j]
             if breaks < y < keeps:
                 if _dot(g, _with_multiplier(y, P, c, g, lower, upper)) >= low[0]:
                     keeps = y

@@ -24,6 +24,15 @@ def ask(u_ref: Any, C: Any, floor: Any, lower: Any, upper: Any) -> Solution:
     return solve(u_ref, C, floor, floor, pack(box(lower, upper)), SCALE)
 
 
+def driven_by_torque(u_ref: Any, C: Any, floor: Any, lower: Any, upper: Any, seed: int) -> Polytope:
+    """The box, and torque limits that cut into it but leave its middle."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(0.0, 0.3, (6, 6))
+    G = A @ A.T + 0.1 * np.eye(6)
+    middle, room = G @ (0.5 * (lower + upper)), np.abs(G) @ (0.5 * (upper - lower))
+    return Polytope(lower, upper, G, middle - rng.uniform(0.2, 1.2, 6) * room, middle + rng.uniform(0.2, 1.2, 6) * room)
+
+
 def problems(count: int, seed: int = 0, rows: int = 8) -> Any:
     rng = np.random.default_rng(seed)
     for _ in range(count):
@@ -57,7 +66,7 @@ def test_the_control_is_the_closest_that_keeps_everything() -> None:
         found = ask(u_ref, C, floor, lower, upper)
         if abs(margin) < 1e-3:
             continue
-        assert found.feasible == (margin > 0.0)
+        assert found.feasible == (margin > 0.0) and found.share == 1.0
         if not found.feasible:
             continue
         assert np.all(C @ found.u >= floor) and np.all((lower <= found.u) & (found.u <= upper))
@@ -79,6 +88,60 @@ def test_the_control_is_the_closest_that_keeps_everything() -> None:
         np.testing.assert_allclose(found.u / SCALE, other.x, atol=2e-4)
         solved += 1
     assert solved > 60
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2])
+def test_torque_limits_are_kept_and_no_more_than_kept(rows: int) -> None:
+    solved = 0
+    for k, (u_ref, C, floor, lower, upper) in enumerate(problems(60, seed=5, rows=rows)):
+        U = driven_by_torque(u_ref, C, floor, lower, upper, k)
+        found = solve(3.0 * u_ref, C, floor, floor, pack(U), SCALE)
+        A, b = np.vstack((C, U.G, -U.G)), np.concatenate((floor, U.low, -U.high))
+        margin = possible(A, b, lower, upper)
+        if abs(margin) < 1e-3:
+            continue
+        assert found.feasible == (margin > 0.0)
+        if not found.feasible:
+            continue
+        assert np.all(A @ found.u >= b) and np.all((lower <= found.u) & (found.u <= upper))
+        goal = 3.0 * u_ref / SCALE
+        other = minimize(
+            lambda x, r=goal: float(np.sum((x - r) ** 2)),
+            0.5 * (lower + upper) / SCALE,
+            jac=lambda x, r=goal: 2.0 * (x - r),
+            bounds=list(zip(lower / SCALE, upper / SCALE, strict=True)),
+            constraints={
+                "type": "ineq",
+                "fun": lambda x, A=A, b=b: A @ (x * SCALE) - b,
+                "jac": lambda x, A=A: A * SCALE,
+            },
+            method="SLSQP",
+            options={"ftol": 1e-12, "maxiter": 200},
+        )
+        if other.success and np.all(A @ (other.x * SCALE) >= b - 1e-9):
+            np.testing.assert_allclose(found.u / SCALE, other.x, atol=2e-4)
+            solved += 1
+    assert solved > 20
+
+
+def test_torque_limits_that_nothing_in_the_box_can_exceed_change_no_bit() -> None:
+    for u_ref, C, floor, lower, upper in problems(40, seed=6, rows=3):
+        G = np.random.default_rng(0).normal(0.0, 1.0, (6, 6))
+        low, high = (np.minimum(G * lower, G * upper).sum(axis=1), np.maximum(G * lower, G * upper).sum(axis=1))
+        wide = pack(Polytope(lower, upper, G, low - 1e-5, high + 1e-5))
+        without, with_limits = ask(u_ref, C, floor, lower, upper), solve(u_ref, C, floor, floor, wide, SCALE)
+        assert without.feasible == with_limits.feasible and without.u.tobytes() == with_limits.u.tobytes()
+
+
+def test_joints_that_have_no_choice_leave_it_to_the_others() -> None:
+    """Boxes narrower than twice the margin that the solver gets."""
+    for width in (0.0, 1e-7):
+        lower = np.append(-SCALE[:1], 0.1 * SCALE[1:])
+        upper = np.append(SCALE[:1], 0.1 * SCALE[1:] + width)
+        C = np.array([[1.0, 0, 0, 0, 0, 0], [1.0, 0.01, 0, 0, 0, 0]])
+        for rows in (1, 2):
+            found = ask(np.zeros(6), C[:rows], np.array([2.0, 2.0])[:rows], lower, upper)
+            assert found.feasible and np.all((lower <= found.u) & (found.u <= upper)), (width, rows)
 
 
 def test_rows_in_conflict_are_infeasible() -> None:
@@ -106,7 +169,7 @@ def test_what_is_no_number_is_infeasible(where: str) -> None:
 
 def test_without_a_binding_row_the_reference_passes_or_meets_the_box() -> None:
     inside = ask(0.1 * SCALE, np.ones((1, 6)), np.array([-1e3]), -SCALE, SCALE)
-    assert inside.feasible and not inside.filtered
+    assert inside.feasible and not inside.filtered and inside.share == 1.0
     np.testing.assert_array_equal(inside.u, 0.1 * SCALE)
     outside = ask(9.0 * SCALE, np.zeros((0, 6)), np.zeros(0), -SCALE, SCALE)
     np.testing.assert_array_equal(outside.u, SCALE)
@@ -180,6 +243,40 @@ def test_the_solver_is_not_believed(u: Any, solved: bool, monkeypatch: pytest.Mo
         assert project(9.0 * ROW, pack(torque), SCALE) is (answer.u if _fits(answer, torque) else None)
 
 
+def test_the_share_that_is_told_is_measured_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    floor, base = np.array([3.0, 3.0]), np.array([1.0, 1.0])
+    for u, kept in ((2.1 * (ROW + OTHER), True), (1.9 * (ROW + OTHER), False)):
+        answers = iter([safe_control._Found(u, 1.0, False, 3), safe_control._Found(u, 0.5, True, 4)])
+        monkeypatch.setattr(safe_control, "_quadratic", lambda *_, answers=answers: next(answers))
+        found = solve(np.zeros(6), np.array([ROW, OTHER]), floor, base, pack(box(-FREE, FREE)), SCALE)
+        assert (found.feasible, found.share, found.iterations) == (kept, 0.5, 7)
+
+
+def test_each_program_has_the_solver_that_can_solve_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    for name in ("_of_piqp", "_of_one_row"):
+        solver = getattr(safe_control, name)
+        monkeypatch.setattr(safe_control, name, lambda *a, name=name, solver=solver: asked.append(name) or solver(*a))
+    torque = Polytope(-FREE, FREE, np.eye(6)[:1], np.array([-1.0]), np.array([1.0]))
+    row, floor = np.array([ROW + OTHER]), np.array([1.5])
+    assert solve(np.zeros(6), row, floor, floor, pack(box(-FREE, FREE)), SCALE).feasible
+    assert asked == ["_of_one_row"]
+    assert project(3.0 * ROW, _packed(torque), SCALE) is not None
+    assert solve(np.zeros(6), row, floor, floor, _packed(torque), SCALE).feasible
+    assert asked == ["_of_one_row", "_of_piqp", "_of_piqp"]
+
+
+def _packed(U: Polytope) -> Any:
+    """With as many torque limits as joints, which is what can be packed: the others are wide."""
+    wide = np.full(5, 1e3)
+    return pack(Polytope(U.lower, U.upper, np.eye(6), np.append(U.low, -wide), np.append(U.high, wide)))
+
+
+def test_a_control_that_is_possible_is_its_own_projection() -> None:
+    u = 0.3 * FREE
+    assert project(u, pack(box(-FREE, FREE)), SCALE) is u
+
+
 def _fits(answer: Any, U: Polytope) -> bool:
     inside = np.all(np.abs(answer.u) <= U.upper) and abs(answer.u[5]) <= U.high[5]
     return bool(answer.solved and inside)
@@ -217,3 +314,11 @@ def test_one_row_in_closed_form_is_what_piqp_says(shared: bool) -> None:
             cost, other = (float(0.5 * v @ P @ v + c @ v) for v in (x, y))
             assert cost <= other + 1e-6 * max(1.0, abs(other))
     assert solved > 200
+
+
+def test_joints_that_the_row_does_not_feel_stay_where_they_are_wanted() -> None:
+    g, low, ends = np.array([[1.0, 0.0, 2.0]]), np.array([2.5]), np.ones(3)
+    with np.errstate(all="raise"):
+        x, solved = safe_control._of_one_row(np.eye(3), np.array([-0.2, -0.3, -0.9]), g, low, -ends, ends)
+    assert solved
+    np.testing.assert_allclose(x, [0.5, 0.3, 1.0], atol=1e-12)
