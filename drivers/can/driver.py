@@ -210,6 +210,8 @@ class Can:
         stream = self._stream
         q, dq, tau = stream.pose()
         flags = RobotFlag.READY | RobotFlag.SERVO_ON
+        if stream.asks_to_slow:
+            flags |= RobotFlag.WARM
         if stream.found:
             flags = RobotFlag.FAULTED
             if any(found.fault is Fault.NO_VOLTAGE for found in stream.found):

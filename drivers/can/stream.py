@@ -44,6 +44,7 @@ class Stream:
         self.expects_power = [False] * n
         self.counters = Counters()
         self.found: list[Found] = []
+        self.asks_to_slow = False  # since the newest cycle was judged
         self.seq = 0
         self.t_rx_ns = 0  # key of the newest sample in the record
         self.targets: Sequence[Target] = ()
@@ -172,7 +173,7 @@ class Stream:
         self._tap_alone(frame, now_ns)
 
     def _judge(self) -> None:
-        now_ns = self.link.now_ns()
+        now_ns, self.asks_to_slow = self.link.now_ns(), False
         if (silent := min(self.missed)) >= SILENT:
             self._note(Found(Fault.SILENT, None, self.seq, f"{silent} cycles"))
         for found in self._watch.bus(self.link.health, self.seq, now_ns):
@@ -192,7 +193,8 @@ class Stream:
 
     def _note(self, found: Found) -> None:
         self.counters.found[found.fault] = self.counters.found.get(found.fault, 0) + 1
-        if found.rule.reaction is Reaction.WARN:
+        self.asks_to_slow |= found.rule.reaction is Reaction.SLOW
+        if found.rule.reaction in (Reaction.WARN, Reaction.SLOW):
             return
         if all((found.fault, found.axis) != (known.fault, known.axis) for known in self.found):
             self.found.append(found)

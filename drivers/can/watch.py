@@ -16,7 +16,8 @@ from drivers.can.reactions import Fault, Found
 URAD = 1e-6
 LOST = 2  # stale times: an axis that has said nothing for so long is dead
 JUMP = 0.02  # rad: more than this between two answers is no motion, beyond what the speed explains
-WARM_C, HOT_C = 70.0, 95.0  # before the drive's own trip at 100 to 120 C
+WARM_C, HEATED_C, HOT_C = 70.0, 85.0, 95.0  # told, slowed down, stopped: before the drive's own trip at 100 to 120 C
+COOLED_C = 5.0  # so much cooler than HEATED_C it must be to go at full speed again
 FOLLOWING_POSITION = 0.15  # rad that a position command may be ahead
 # rad/s of summed disagreement between expected and seen speed, forgotten by FORGET a cycle. In 30 s beside a person the
 # simulated arms came to 0.02 (differenced) and 0.10 (told in steps). An axis that is held while it is asked for more
@@ -47,6 +48,7 @@ class AxisState:
     seq: int = 0  # of our cycle that it answers
     beat_ns: int = 0  # of the newest heartbeat; 0: none yet
     emergency: str = ""
+    is_heated: bool = False  # it asks for rest
     lost: int = 0  # answers that never came, in all
     faults: set[Fault] = field(default_factory=set)
 
@@ -137,10 +139,22 @@ class Watch:
             yield Found(Fault.NO_VOLTAGE, i, seq, told.words)
         elif expects_power and told.power is Power.DISABLED:
             yield Found(Fault.DISABLED, i, seq, told.words)
-        if told.hottest_c is not None and told.hottest_c >= HOT_C:
-            yield Found(Fault.HOT, i, seq, f"{told.hottest_c:.0f} C")
-        elif told.warning or (told.hottest_c is not None and told.hottest_c >= WARM_C):
-            yield Found(Fault.WARM, i, seq, told.words if told.warning else f"{told.hottest_c:.0f} C")
+        yield from self._temperature(i, state, told, seq)
+
+    def _temperature(self, i: int, state: AxisState, told: Feedback, seq: int) -> Iterator[Found]:
+        """By its figure, or by the warning of a drive that tells none in the cycle: which comes before its trip."""
+        if told.hottest_c is None:
+            if told.warning:
+                yield Found(Fault.HEATED, i, seq, "the drive warns")
+            return
+        state.is_heated = told.hottest_c >= HEATED_C - (COOLED_C if state.is_heated else 0.0)
+        detail = f"{told.hottest_c:.0f} C"
+        if told.hottest_c >= HOT_C:
+            yield Found(Fault.HOT, i, seq, detail)
+        if state.is_heated:
+            yield Found(Fault.HEATED, i, seq, detail)
+        elif told.hottest_c >= WARM_C:
+            yield Found(Fault.WARM, i, seq, detail)
 
     def moved(self, i: int, before: AxisState, after: AxisState, seq: int) -> Iterator[Found]:
         """Two answers of one axis: is what lies between them a motion?"""

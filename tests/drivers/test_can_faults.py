@@ -190,6 +190,24 @@ def test_what_is_only_a_warning_moves_on(enabled: dict[str, Rig], name: str, val
     assert rig.driver.report()["found"][fault] > 0
 
 
+@pytest.mark.parametrize("speed", [0.0, SPEED], ids=["at rest", "at speed"])
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_drive_that_needs_rest_slows_the_arm_until_it_has_cooled(
+    enabled: dict[str, Rig], arm: str, speed: float
+) -> None:
+    """Seen in two cycles by its figure or its warning, and no stop; 5 K of hysteresis where there is a figure."""
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, speed)
+    tells_figure = arm == "openarm"
+    for celsius, asks in ((84.0, False), (85.0, True), (81.0, tells_figure), (79.0, False), (84.0, False)):
+        rig.strike("hot", SICK + 1, celsius)
+        for _ in range(2):
+            sample = step(rig, wanted(), speed)
+        assert sample is not None and RobotFlag.READY in sample.flags
+        assert (RobotFlag.WARM in sample.flags) is asks, f"at {celsius:g} C"
+    assert rig.driver.report()["found"][Fault.HEATED] > 0 and rig.driver.fault is None
+
+
 def test_nothing_is_enabled_or_reset_by_itself(enabled: dict[str, Rig]) -> None:
     rig = copy.deepcopy(enabled["openarm"])
     run_up(rig, 0.0)
