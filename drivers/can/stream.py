@@ -150,7 +150,7 @@ class Stream:
         self._newest[i], self.t_rx_ns = frame, now_ns
         if told.hottest_c is not None:
             self.counters.worst_c = max(self.counters.worst_c, told.hottest_c)
-        for found in self._watch.moved(i, before, axis, self.seq):
+        for found in self._watch.moved(i, before, axis, elapsed, self.seq):
             self._note(found)
 
     def _elapsed(self, axis: AxisState, frame: Frame, now_ns: int) -> float:

@@ -48,8 +48,9 @@ class Cia402Drive:
     def __init__(self, node: int, data: Data) -> None:
         self.node, self.data = node, data
         self.state, self.nmt = DISABLED, PRE_OPERATIONAL
-        self.coil_c, self.offset, self.age = 30.0, 0.0, 0.0
-        self.is_silent = self.heart_stopped = False
+        self.coil_c, self.age = 30.0, 0.0
+        self.offset = self.drift = 0.0  # rad that the encoder is off; rad/s
+        self.is_silent = self.heart_stopped = self.is_deaf = False
         self.voltage = True
         self.brake_stuck_open = False
         self.q = self.dq = self.tau = 0.0
@@ -115,7 +116,8 @@ class Cia402Drive:
             self._refresh()
             answer = [Frame(self._od[0x1800, 1], self._gather(0x1A00))]
         for mapping, data in sorted(self._staged.items()):
-            self._scatter(mapping, data)
+            if not self.is_deaf:
+                self._scatter(mapping, data)
         self._staged.clear()
         self._control(self._od[0x6040, 0])
         return answer
@@ -124,7 +126,8 @@ class Cia402Drive:
         q = self.q + self.dq * self.age + self.offset
         self._od[0x6064, 0] = _wrap(round(q * self._counts()), 32)
         self._od[0x6077, 0] = _wrap(round(self.tau / self.data.rated * 1000), 16)
-        follows = FOLLOWS if self.state == ENABLED and self._od[0x6060, 0] in (POSITION, VELOCITY, TORQUE) else 0
+        hears = self._od[0x6060, 0] in (POSITION, VELOCITY, TORQUE) and not self.is_deaf
+        follows = FOLLOWS if self.state == ENABLED and hears else 0
         warm = WARNING if self.coil_c >= WARM_C else 0
         self._od[0x6041, 0] = self.state | REMOTE | follows | warm | (VOLTAGE if self.voltage else 0)
         self._od[0x6061, 0] = self._od[0x6060, 0]
@@ -212,11 +215,21 @@ class Cia402Drive:
     def trip_over_current(self) -> None:
         self._fail(EMCY["current"])
 
+    def say_emergency(self, code: int) -> None:
+        self._emergency(code)
+
+    def stop_by_itself(self) -> None:
+        self._begin_stop()
+
+    def ignore_targets(self) -> None:
+        self.is_deaf = True
+
     def switch_off(self) -> None:
         self.state = DISABLED
 
     def tick(self, q: float, dq: float, elapsed_ns: int) -> float:
         self.q, self.dq = q, dq
+        self.offset += self.drift * elapsed_ns * 1e-9
         self._master_ns += elapsed_ns
         self._rpdo_ns = [age_ns + elapsed_ns for age_ns in self._rpdo_ns]
         if self.state == ENABLED and self.nmt == OPERATIONAL:

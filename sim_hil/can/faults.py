@@ -28,6 +28,10 @@ def _echo(line: Line, i: int, value: float) -> None:
     line.echo.add(i)
 
 
+def _short(line: Line, i: int, value: float) -> None:
+    line.short.add(i)
+
+
 def _silence(line: Line, i: int, value: float) -> None:
     line.drives[i].is_silent = True
 
@@ -48,6 +52,22 @@ def _safe_torque_off(line: Line, i: int, value: float) -> None:
 
 def _trip(line: Line, i: int, value: float) -> None:
     line.drives[i].trip_over_current()
+
+
+def _emergency(line: Line, i: int, value: float) -> None:
+    line.drives[i].say_emergency(round(value))
+
+
+def _stops(line: Line, i: int, value: float) -> None:
+    line.drives[i].stop_by_itself()
+
+
+def _deaf(line: Line, i: int, value: float) -> None:
+    line.drives[i].ignore_targets()
+
+
+def _drift(line: Line, i: int, value: float) -> None:
+    line.drives[i].drift = value
 
 
 def _disable(line: Line, i: int, value: float) -> None:
@@ -86,13 +106,18 @@ FAULTS: dict[str, Action] = {
     "lose": _lose,  # value: frames of the drive
     "late": _late,  # value: ms
     "echo": _echo,
+    "short": _short,
     "silence": _silence,
     "heartbeat": _heartbeat,
     "power_cut": _power_cut,
     "safe_torque_off": _safe_torque_off,
     "trip": _trip,
+    "emergency": _emergency,  # value: code of the EMCY
+    "stops": _stops,
+    "deaf": _deaf,
     "disable": _disable,
     "encoder": _encoder,  # value: rad
+    "drift": _drift,  # value: rad/s
     "block": _block,
     "hot": _hot,  # value: deg C
     "corrupt": _corrupt,  # value: frames

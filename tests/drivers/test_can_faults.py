@@ -53,9 +53,14 @@ ROWS = {
     "gone": Row(Fault.INTERFACE_GONE, lambda rig: setattr(rig.line, "gone", True), 2, sick=()),
     "backlog": Row(Fault.BACKLOG, lambda rig: setattr(rig.line, "full", 3), 2, sick=()),
     "drive fault": Row(Fault.AXIS_FAULT, once("trip"), 2),
+    "emergency": Row(Fault.AXIS_FAULT, once("emergency", 0x7305), 2, arms=("panda",)),
+    "stops by itself": Row(Fault.AXIS_FAULT, once("stops"), 2, arms=("panda",)),
+    "deaf": Row(Fault.DISABLED, once("deaf"), 2, arms=("panda",)),
+    "wrong length": Row(Fault.STALE, once("short"), 4),
     "disabled": Row(Fault.DISABLED, once("disable"), 2),
     "safe torque off": Row(Fault.NO_VOLTAGE, once("safe_torque_off", axis=0), 2, sick=tuple(range(7))),
     "encoder": Row(Fault.ENCODER, once("encoder", 0.2), 2),
+    "slip": Row(Fault.ENCODER, once("drift", 2.5), 4, arms=("openarm",)),  # the other tells no speed to compare with
     "blocked": Row(Fault.FOLLOWING, once("block"), 60, only_moving=True),
     "heartbeat": Row(Fault.HEARTBEAT, once("heartbeat"), 52, sick=(), arms=("panda",)),
     "hot": Row(Fault.HOT, once("hot", 96.0), 2, sick=(), arms=("openarm",)),
@@ -230,6 +235,38 @@ def test_a_velocity_is_followed(enabled: dict[str, Rig], arm: str) -> None:
         sample = rig.cycle(JointCommand(0, CommandKind.VELOCITY, vector(q), vector(dq), tau, False))
         assert sample is not None and RobotFlag.READY in sample.flags
     np.testing.assert_allclose(rig.line.mechanics.dq, 0.3, atol=0.03)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_axis_that_is_held_is_seen_when_a_velocity_is_commanded(enabled: dict[str, Rig], arm: str) -> None:
+    rig = copy.deepcopy(enabled[arm])
+    run_up(rig, 0.0)
+    q, dq = rig.driver.read(rig.now_ns()).q, vector(np.full(7, SPEED))
+    command = JointCommand(0, CommandKind.VELOCITY, q, dq, rig.driver.dynamics(q, dq, np.zeros(7)), False)
+    for _ in range(60):
+        sample = rig.cycle(command)
+        assert sample is not None and RobotFlag.READY in sample.flags
+    rig.strike("block", SICK + 1)
+    struck = rig.driver._stream.seq
+    while not rig.driver._stream.found:
+        rig.cycle(command)
+        assert rig.driver._stream.seq < struck + 80
+    assert {(found.fault, found.axis) for found in rig.driver._stream.found} == {(Fault.FOLLOWING, SICK)}
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_axis_where_no_axis_can_be_is_not_believed(enabled: dict[str, Rig], arm: str) -> None:
+    """Told in steps that are no jump each: the zero of the encoder goes away."""
+    rig = copy.deepcopy(enabled[arm])
+    wanted, joint = run_up(rig, 0.0), rig.driver._codec.joints[3]
+    edge = joint.q_max + 0.1
+    while not rig.driver._stream.found:
+        rig.strike("encoder", 4, 0.015)
+        told = rig.driver.read(rig.now_ns()).q
+        step(rig, vector(np.where(np.arange(7) == 3, told, wanted())), 0.0)
+        assert told[3] < edge + 0.05
+    (found,) = rig.driver._stream.found
+    assert found.fault is Fault.ENCODER and found.axis == 3 and "outside its range" in found.detail
 
 
 @pytest.mark.parametrize("arm", ARMS)
