@@ -5,7 +5,8 @@ Script entries: {at_s, fault, axis?, value?}; `axis` counts from 1, 0 is every a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -139,18 +140,40 @@ class Fault:
         if not isinstance(entry, dict) or not {"at_s", "fault"} <= set(entry) <= set(_KEYS):
             raise ValueError(f"a fault is a table with {', '.join(_KEYS)}, not {entry!r}")
         fault = cls(**entry)
-        numbers = all(type(n) in (int, float) for n in (fault.at_s, fault.value)) and type(fault.axis) is int
-        if fault.fault not in FAULTS or not numbers or fault.at_s < 0 or fault.axis < 0:
-            raise ValueError(f"{entry} is no fault; faults: {', '.join(FAULTS)}")
+        if not isinstance(fault.fault, str) or fault.fault not in FAULTS:
+            raise ValueError(f"{fault.fault!r} is no fault; faults: {', '.join(FAULTS)}")
+        if not (_is_number(fault.at_s) and fault.at_s >= 0):
+            raise ValueError(f"at_s: {fault.at_s!r} is no time; seconds from the first client on, at least 0")
+        if type(fault.axis) is not int or fault.axis < 0:
+            raise ValueError(f"axis: {fault.axis!r} is no axis; they count from 1, 0 is every one")
+        low, high = _VALUES.get(fault.fault, (-math.inf, math.inf))
+        if not (_is_number(fault.value) and low <= fault.value <= high):
+            raise ValueError(
+                f"value: {fault.value!r} is not possible; of {fault.fault!r} a number from {low:g} to {high:g}"
+            )
         return fault
 
     def strike(self, line: Line) -> None:
-        """IndexError: there is no such axis."""
+        """IndexError: there is no such axis, see `check_axes`."""
         axes = range(len(line.drives)) if self.axis == 0 else [self.axis - 1]
         for i in axes if self.fault not in _OF_THE_BUS else [0]:
             FAULTS[self.fault](line, i, self.value)
 
 
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+
+
+def check_axes(script: Sequence[Fault], axes: int) -> None:
+    """ValueError: faults of axes that this arm does not have."""
+    wrong = [f"fault {fault.fault!r}: axis {fault.axis} of {axes}" for fault in script if fault.axis > axes]
+    if wrong:
+        raise ValueError("\n".join(wrong))
+
+
+# What else would be no frame, or no number of frames.
+_VALUES = {"lose": (0, 1e6), "corrupt": (0, 1e6), "late": (0, 1e3), "babble": (0, 0x7FF), "emergency": (0, 0xFFFF)}
+_VALUES["hot"] = (0, 255)  # as much as the answer has bits for
 _OF_THE_BUS = ("corrupt", "unplug", "babble")
 
 
