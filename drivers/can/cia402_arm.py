@@ -9,6 +9,7 @@ cycle.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -143,6 +144,7 @@ class Cia402Arm:
         yield Finding(
             f"{name} scale", told == wanted, f"{told}, expected {wanted}", "set 608F, 6091, 6076 of the drive"
         )
+        yield _limits(name, node, scale, self.joints[i])
         modes = node[0x6502].raw
         missing = [mode.name for mode in WANTED_MODES if not modes >> (mode - 1) & 1]
         yield Finding(f"{name} modes", not missing, f"lacks {missing}" if missing else "cyclic ones", "another drive")
@@ -179,6 +181,19 @@ class Cia402Arm:
             return _write(f"axis {i + 1} watchdog", Service(link, self.nodes[i]), wanted)
         except (SdoError, SdoCommunicationError) as error:
             return Finding(f"axis {i + 1} watchdog", False, str(error), "the drive does not take its time-outs")
+
+
+def _limits(name: str, node: Service, scale: Scale, joint: Joint) -> Finding:
+    """The drive's software position limits equal the joint's to the count: the second line of defence of the arm."""
+    wanted = tuple(sorted((scale.counts(joint.q_min), scale.counts(joint.q_max))))
+    told = (node[0x607D][1].raw, node[0x607D][2].raw)
+    degrees = " to ".join(f"{math.degrees(q):.3f}" for q in sorted(map(scale.radians, told)))
+    return Finding(
+        f"{name} limits",
+        told == wanted,
+        f"607Dh is {told[0]} to {told[1]} counts ({degrees} deg), expected {wanted[0]} to {wanted[1]}",
+        f"set 607Dh:01 = {wanted[0]} and 607Dh:02 = {wanted[1]} in the drive, or correct the joint's range in arms.py",
+    )
 
 
 def _map(node: Service, communication: int, cob_id: int, entries: Sequence[int]) -> None:

@@ -104,6 +104,7 @@ class Can:
             pacing=Pacing.HOST,
             kinds=self._codec.kinds,
             period_ns=self._options.period_ns,
+            reach=(vector([j.q_min for j in self._codec.joints]), vector([j.q_max for j in self._codec.joints])),
             identity=f"{self._options.arm} on {self._options.interface} {self._options.channel}",
         )
 

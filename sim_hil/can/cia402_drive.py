@@ -39,6 +39,7 @@ class Data:
     kd: float  # Nms/rad
     resolution: int = 1 << 17
     gear: tuple[int, int] = (100, 1)
+    limits_deg: tuple[float, float] = (-360.0, 360.0)  # it lets no position target go beyond
     serial: int = 1
     revision: int = 0x0002_0001
     holds: bool = True
@@ -257,7 +258,8 @@ class Cia402Drive:
             self._last_target = self.q
             return self._od[0x6071, 0] / 1000 * d.rated + offset
         if self.state == ENABLED and self._od[0x6060, 0] == POSITION:
-            target = self._od[0x607A, 0] / self._counts() - self.offset
+            counts = min(max(self._od[0x607A, 0], self._od[0x607D, 1]), self._od[0x607D, 2])
+            target = counts / self._counts() - self.offset
             return d.kp * (target - self.q) - d.kd * self.dq + offset
         if self.state == ENABLED and self._od[0x6060, 0] == VELOCITY:
             self._last_target = self.q
@@ -283,6 +285,8 @@ def _objects(node: int, d: Data) -> dict[tuple[int, int], int]:
     od |= {(0x1016, 0): 1, (0x1016, 1): 0, (0x1018, 0): 4, (0x1018, 1): 0x1234, (0x1018, 2): 7}
     od |= {(0x1018, 3): d.revision, (0x1018, 4): d.serial, (0x605A, 0): 2, (0x6007, 0): 1}
     od |= {(0x608F, 0): 2, (0x608F, 1): d.resolution, (0x608F, 2): 1, (0x6091, 0): 2}
+    least, greatest = (round(deg / 360 * d.resolution * d.gear[0] / d.gear[1]) for deg in d.limits_deg)
+    od |= {(0x607D, 0): 2, (0x607D, 1): least, (0x607D, 2): greatest}
     od |= {(0x6091, 1): d.gear[0], (0x6091, 2): d.gear[1], (0x60C2, 0): 2, (0x60C2, 1): 1, (0x60C2, 2): -3}
     for k in range(4):  # as they come from the factory: the spare ones are on
         od |= {(0x1400 + k, 0): 5, (0x1400 + k, 1): 0x200 + 0x100 * k + node, (0x1400 + k, 2): 255}
@@ -305,7 +309,7 @@ def _size(index: int, sub: int) -> int:
 
 
 def _signed(index: int, sub: int = 0) -> bool:
-    return _FORMATS.get(index, "<I")[1].islower() or (index == 0x60C2 and sub == 2)
+    return _FORMATS.get(index, "<I")[1].islower() or (index == 0x60C2 and sub == 2) or (index == 0x607D and sub > 0)
 
 
 def _wrap(value: int, bits: int) -> int:
