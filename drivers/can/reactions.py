@@ -76,7 +76,10 @@ RULES = {
     Fault.FLOOD: Rule(Reaction.STOP, "somebody else sends on this bus: take it off", is_axis=False),
     Fault.LATE: Rule(Reaction.WARN, "asc doctor: is this PC fit for the period?", is_axis=False),
     Fault.OVERRUN: Rule(Reaction.STOP, "this PC is too slow or busy: asc doctor", is_axis=False),
-    Fault.BRAKE: Rule(Reaction.STOP, "support the arm; the brake must be serviced"),
+    Fault.BRAKE: Rule(
+        Reaction.STOP,
+        "support the arm before its power goes; brake or contact must be serviced",
+    ),
 }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from asc_rt.core.types import CommandKind, Vector, vector
 from drivers.base import ProtocolError, WireTap
-from drivers.can.arm import ArmCodec, Emergency, Feedback, Heartbeat, Power, Target, Wish
+from drivers.can.arm import ArmCodec, Brake, Emergency, Feedback, Heartbeat, Power, Target, Wish
 from drivers.can.frame import Frame, bundle
 from drivers.can.link import Link
 from drivers.can.reactions import Fault, Found, Reaction
@@ -132,6 +132,8 @@ class Stream:
                 self._take(i, what, frame, now_ns)
             case Heartbeat():
                 self.axes[i].beat_ns = now_ns
+            case Brake():
+                self.axes[i].brake_closed = self.axes[i].brake_closed if what.closed is None else what.closed
             case Emergency():
                 self.axes[i].emergency = what.words or self.axes[i].emergency
                 self._tap_alone(frame, now_ns)

@@ -54,6 +54,7 @@ class AxisState:
     seq: int = 0  # of our cycle that it answers
     beat_ns: int = 0  # of the newest heartbeat; 0: none yet
     emergency: str = ""
+    brake_closed: bool | None = None  # as its contact told since it was asked
     is_heated: bool = False  # it asks for rest
     slips: int = 0  # answers in a row whose position and speed disagree
     lost: int = 0  # answers that never came, in all

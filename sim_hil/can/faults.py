@@ -67,6 +67,14 @@ def _deaf(line: Line, i: int, value: float) -> None:
     line.drives[i].ignore_targets()
 
 
+def _brake(line: Line, i: int, value: float) -> None:
+    line.drives[i].jam_brake(value > 0, contact=False)
+
+
+def _contact(line: Line, i: int, value: float) -> None:
+    line.drives[i].jam_brake(value > 0, contact=True)
+
+
 def _drift(line: Line, i: int, value: float) -> None:
     line.drives[i].drift = value
 
@@ -116,6 +124,8 @@ FAULTS: dict[str, Action] = {
     "emergency": _emergency,  # value: code of the EMCY
     "stops": _stops,
     "deaf": _deaf,
+    "brake": _brake,  # value: 1 stays closed, 0 open
+    "contact": _contact,  # value: 1 tells closed, 0 open
     "disable": _disable,
     "encoder": _encoder,  # value: rad
     "drift": _drift,  # value: rad/s

@@ -37,6 +37,9 @@ class Drive(Protocol):
         """And go on as if nothing were."""
 
     def stop_by_itself(self) -> None: ...
+    def jam_brake(self, closed: bool, contact: bool) -> None:
+        """It, or its contact only, stays so."""
+
     def ignore_targets(self) -> None:
         """And tell so."""
 

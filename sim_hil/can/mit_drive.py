@@ -141,6 +141,9 @@ class MitDrive:
     def stop_by_itself(self) -> None:
         """It has no such state."""
 
+    def jam_brake(self, closed: bool, contact: bool) -> None:
+        """There is none."""
+
     def ignore_targets(self) -> None:
         """It has no such flag."""
 

@@ -19,6 +19,7 @@ from can_through import has_vcan
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, Vector, vector
 from drivers.base import RobotFaulted
+from drivers.can import arms
 from drivers.can.arm import Power
 from drivers.can.reactions import RULES, Fault, Reaction
 
@@ -62,6 +63,7 @@ ROWS = {
     "encoder": Row(Fault.ENCODER, once("encoder", 0.2), 2),
     "slip": Row(Fault.ENCODER, once("drift", 2.5), 4, arms=("openarm",)),  # the other tells no speed to compare with
     "blocked": Row(Fault.FOLLOWING, once("block"), 60, only_moving=True),
+    "brake closes": Row(Fault.FOLLOWING, once("brake"), 60, only_moving=True, arms=("panda",)),
     "heartbeat": Row(Fault.HEARTBEAT, once("heartbeat"), 52, sick=(), arms=("panda",)),
     "hot": Row(Fault.HOT, once("hot", 96.0), 2, sick=(), arms=("openarm",)),
     "flood": Row(Fault.FLOOD, once("babble", 0x55), 16, sick=()),
@@ -224,6 +226,52 @@ def test_nothing_is_enabled_or_reset_by_itself(enabled: dict[str, Rig]) -> None:
     assert not special and rig.driver._stream.powers()[SICK] is Power.DISABLED
 
 
+@pytest.mark.parametrize("speed", [0.0, SPEED], ids=["at rest", "at speed"])
+@pytest.mark.parametrize("jammed", ["brake", "contact"])
+def test_an_axis_whose_brake_does_not_tell_that_it_has_closed_keeps_its_power(
+    enabled: dict[str, Rig], jammed: str, speed: float
+) -> None:
+    """Told once the arm is at rest; the others are braked and switched off, and nothing gives way."""
+    rig = copy.deepcopy(enabled["panda"])
+    run_up(rig, speed)
+    rig.strike(jammed, SICK + 1, 0.0)
+    rig.driver.stop()
+    rest, drives = rig.line.mechanics.q.copy(), rig.line.drives
+    rig.run(1_000_000_000)
+    np.testing.assert_allclose(rig.line.mechanics.q, rest, atol=1e-3)
+    assert [drive.is_enabled for drive in drives] == [i == SICK for i in range(7)]
+    assert all(drive.brake_closed for i, drive in enumerate(drives) if i != SICK)
+    (found,) = rig.driver._stream.found
+    assert (found.fault, found.axis) == (Fault.BRAKE, SICK) and "support the arm" in rig.driver.fault.hint
+
+
+def test_brakes_are_closed_before_the_power_goes(enabled: dict[str, Rig]) -> None:
+    rig = copy.deepcopy(enabled["panda"])
+    run_up(rig, SPEED)
+    tick, unbraked = rig.line.tick, []
+    rig.line.tick = lambda t_ns: (
+        tick(t_ns), unbraked.extend(d.node for d in rig.line.drives if not d.is_enabled and not d._contact)
+    )[0]  # fmt: skip
+    rig.driver.stop()
+    assert not unbraked and rig.driver.fault is None
+    assert not any(drive.is_enabled for drive in rig.line.drives)
+
+
+def test_without_contacts_the_drives_close_their_brakes_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    without = dataclasses.replace(arms.ARMS["panda"], brake_contact=None)  # type: ignore[type-var]
+    monkeypatch.setitem(arms.ARMS, "panda", without)
+    rig = Rig("panda")
+    asked: list[int] = []
+    rig.driver.configure()
+    rig.line.listeners.append(
+        lambda d: asked.append(d.frame.id) if d.frame.data[1:3] in (b"\xfd\x60", b"\xfe\x60") else None
+    )
+    rig.driver.activate(rig.period_ns)
+    rig.driver.stop()
+    assert rig.driver.fault is None and not asked
+    assert all(drive.brake_closed and not drive.is_enabled for drive in rig.line.drives)
+
+
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_velocity_is_followed(enabled: dict[str, Rig], arm: str) -> None:
     rig = copy.deepcopy(enabled[arm])
@@ -256,17 +304,19 @@ def test_an_axis_that_is_held_is_seen_when_a_velocity_is_commanded(enabled: dict
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_an_axis_where_no_axis_can_be_is_not_believed(enabled: dict[str, Rig], arm: str) -> None:
-    """Told in steps that are no jump each: the zero of the encoder goes away."""
+    """The zero of the encoder goes away, in steps that are neither a jump nor a slip, and the target goes with it."""
     rig = copy.deepcopy(enabled[arm])
     wanted, joint = run_up(rig, 0.0), rig.driver._codec.joints[3]
-    edge = joint.q_max + 0.1
+    rig.strike("block", 4)
+    step_by, edge = (-0.004, joint.q_min - 0.1) if arm == "openarm" else (0.015, joint.q_max + 0.1)
     while not rig.driver._stream.found:
-        rig.strike("encoder", 4, 0.015)
+        rig.strike("encoder", 4, step_by)
         told = rig.driver.read(rig.now_ns()).q
+        assert (told[3] - edge) * np.sign(step_by) < 0.05
         step(rig, vector(np.where(np.arange(7) == 3, told, wanted())), 0.0)
-        assert told[3] < edge + 0.05
     (found,) = rig.driver._stream.found
     assert found.fault is Fault.ENCODER and found.axis == 3 and "outside its range" in found.detail
+    assert (rig.driver._stream.axes[3].feedback.q - edge) * np.sign(step_by) > 0.0
 
 
 @pytest.mark.parametrize("arm", ARMS)

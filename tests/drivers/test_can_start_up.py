@@ -106,6 +106,8 @@ AFTER: dict[str, tuple[str, str, Callable[[Rig], Any]]] = {  # what goes wrong o
     "refuses its time-out": ("panda", "axis 4 watchdog", refuses_its_timeout),
     "ignores to be enabled": ("openarm", "enable axis 4", lambda rig: ignores(rig, "_special")),
     "is never ready": ("panda", "enable axis 4", never_enables),
+    "a brake that stays closed": ("panda", "brake of axis 4", lambda rig: rig.strike("brake", SICK + 1, 1.0)),
+    "a contact that tells closed": ("panda", "brake of axis 4", lambda rig: rig.strike("contact", SICK + 1, 1.0)),
     "gives way": ("openarm", "hold", lambda rig: rig.line.mechanics.load.__setitem__(0, 12.0)),
 }
 
@@ -139,7 +141,7 @@ def test_what_goes_wrong_with_the_arm_refuses_the_start(wrong: str) -> None:
     with pytest.raises(HandshakeError, match=f"start-up refused: {line}: ") as refused:
         rig.driver.activate(rig.period_ns)
     assert refused.value.hint
-    if not line.startswith(("enable", "hold")):
+    if not line.startswith(("enable", "brake", "hold")):
         assert not any(d.is_enabled for d in rig.line.drives), "nothing is enabled before all is known to be well"
 
 
