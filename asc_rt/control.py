@@ -11,12 +11,15 @@ if __name__ == "__main__":
     realtime.one_blas_thread()  # before anything below imports numpy
 
 import argparse
+import math
 import os
 import signal
 import sys
 import time
 import traceback
 from typing import Any
+
+import numpy as np
 
 from asc_rt import pacing, topics
 from asc_rt.bus import Bus, BusError, open_client
@@ -46,6 +49,7 @@ from drivers.base import (
 )
 
 COMPLETED, FAILED, NOT_BEGUN = 0, 1, 2
+REACH_TOLERANCE = 1e-4  # rad: rounding of degrees in files and of counts in drives
 
 
 class RingRecorder:
@@ -171,12 +175,34 @@ def _check(caps: DriverCaps, system: System) -> None:
             f"the cell commands {wanted.name.lower()}, the robot ({caps.identity}) takes {told}",
             hint="set control.level of the cell as the robot can, or use another driver",
         )
+    _check_reach(caps, system)
     if caps.tells_tool != system.params.changer.told_by_robot:
         says = "tells the number of its tool" if caps.tells_tool else "tells no tool"
         raise HandshakeError(
             f"the robot {says}, the cell says otherwise",
             hint='let [tools] told_by be "robot" if the driver hears the changer (driver.tool_input), else "operator"',
         )
+
+
+def _check_reach(caps: DriverCaps, system: System) -> None:
+    """A cell that may go farther than the robot lets it would be stopped there by the robot, however fast it is."""
+    if caps.reach is None:
+        return
+    (low, high), least, greatest = caps.reach, system.bounds.q_min, system.bounds.q_max
+    inside = (low - REACH_TOLERANCE <= least) & (greatest <= high + REACH_TOLERANCE)
+    beyond = [
+        f"joint {i + 1}: {_degrees(least[i], greatest[i])} in the cell, {_degrees(low[i], high[i])} in the robot"
+        for i in np.flatnonzero(~inside)
+    ]
+    if beyond:
+        raise HandshakeError(
+            f"the cell's robot goes farther than the robot ({caps.identity}) lets it: {'; '.join(beyond)}",
+            hint="narrow position_deg of the robot's profile.toml, or widen the limits in the drives and in the driver",
+        )
+
+
+def _degrees(low: float, high: float) -> str:
+    return f"{math.degrees(low):.4f} to {math.degrees(high):.4f} deg"
 
 
 def _certified(cell: Cell, system: System) -> None:

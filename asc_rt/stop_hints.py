@@ -22,6 +22,7 @@ HINTS: dict[StopReason, str] = {
     R.START_INSIDE: "ask the person to step back beyond the rearm distance, then arm",
     R.LATE: "see what loads this PC (asc doctor), then arm",
     R.SEPARATION: "wait until the person has gone farther away, then arm",
+    R.ROBOT_WARM: "let its drives cool down: it goes slowly until then",
     R.HUMAN_SCHEMA: "let perception and control run the same version; start the session again",
     R.HUMAN_CLOCK: "start perception anew, so that it measures this PC's clock; start the session again",
     R.HUMAN_CALIBRATION: "let perception use the calibration that the cell names; start the session again",

@@ -40,6 +40,7 @@ class DriverCaps:
     period_ns: int  # nominal
     identity: str  # model, protocol, version as the device tells them
     limits: JointLimits | None = None  # None: it tells none; the profile's are all there is
+    reach: tuple[Vector, Vector] | None = None  # least and greatest q that the robot itself lets through, rad
     tells_tool: bool = False  # True: JointState.tool_id is the tool changer's word
 
 

@@ -57,7 +57,7 @@ def next_mode(
     if state.mode.is_over:
         return state
     people = judge(params.human, x)
-    state = dataclasses.replace(state, slow=max(people.slow, StopReason.LATE if x.late else StopReason.NONE))
+    state = dataclasses.replace(state, slow=_caution(state, x, people.slow))
     finding = _finding(params, state, x, people.stop, monitor)
     state = _hear(params, state, x, finding, d_measured, weighs_other)
     if finding.is_fault or (state.mode is Mode.ACTIVE and finding is not StopReason.NONE):
@@ -65,6 +65,13 @@ def next_mode(
     if state.mode is Mode.STOPPING and at_rest(state):
         return dataclasses.replace(state, mode=_after_stop(state))
     return state
+
+
+def _caution(state: CoreState, x: CycleInputs, people: StopReason) -> StopReason:
+    """The worst reason to go slowly. A cycle without a sample says nothing new of the robot."""
+    late = StopReason.LATE if x.late else StopReason.NONE
+    is_warm = state.slow is StopReason.ROBOT_WARM if x.joint is None else RobotFlag.WARM in x.joint.flags
+    return max(people, late, StopReason.ROBOT_WARM if is_warm else StopReason.NONE)
 
 
 def stopping(state: CoreState, reason: StopReason) -> CoreState:

@@ -47,6 +47,7 @@ class RobotFlag(IntFlag):
     MOVING = 4
     EMERGENCY_STOP = 8
     FAULTED = 16
+    WARM = 32  # it still does all that it is asked for, and had better be asked for less
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,15 +197,16 @@ class StopReason(IntEnum):
     START_INSIDE = 14  # armed while a person was already too close
     LATE = 15
     SEPARATION = 16  # nearer than the protective separation distance, where the cell enforces it
-    HUMAN_SCHEMA = 17  # a sensor speaks another version of the message
-    HUMAN_CLOCK = 18  # a sensor stamps with another clock, or ahead of it
-    HUMAN_CALIBRATION = 19  # a sensor is calibrated otherwise than the cell says
-    TRACKING = 20  # the robot does not follow its set-points
-    GATE = 21
-    EXCEPTION = 22  # a defect of the controller itself
-    ROBOT_NOT_READY = 23
-    ROBOT_SILENT = 24
-    ROBOT_FAULTED = 25
+    ROBOT_WARM = 17  # its drives ask for caution: a reason to go slowly only
+    HUMAN_SCHEMA = 18  # a sensor speaks another version of the message
+    HUMAN_CLOCK = 19  # a sensor stamps with another clock, or ahead of it
+    HUMAN_CALIBRATION = 20  # a sensor is calibrated otherwise than the cell says
+    TRACKING = 21  # the robot does not follow its set-points
+    GATE = 22
+    EXCEPTION = 23  # a defect of the controller itself
+    ROBOT_NOT_READY = 24
+    ROBOT_SILENT = 25
+    ROBOT_FAULTED = 26
 
     @property
     def is_fault(self) -> bool:

@@ -28,7 +28,8 @@ class Wish(Enum):
 
     LOOK = auto()  # it is only asked how it is: before anything is known of it
     KEEP = auto()  # as it is: an axis that fell out stays out
-    ENABLE = auto()
+    ENABLE = auto()  # and open the brake
+    BRAKE = auto()  # as it is, and close the brake
     DISABLE = auto()
 
 
@@ -57,7 +58,14 @@ class Emergency:
     words: str  # "": what it was is over
 
 
-Heard = Feedback | Heartbeat | Emergency
+@dataclass(frozen=True, slots=True)
+class Brake:
+    """What the brake's own contact tells."""
+
+    closed: bool | None  # None: the drive has heard of it, and tells nothing
+
+
+Heard = Feedback | Heartbeat | Emergency | Brake
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +107,10 @@ class ArmCodec(Protocol):
     @property
     def heartbeat_ns(self) -> int:
         """0: these drives have none."""
+
+    @property
+    def tells_brakes(self) -> bool:
+        """Wishes of ENABLE and BRAKE are answered by what the contact of the brake tells."""
 
     @property
     def resolution(self) -> float:

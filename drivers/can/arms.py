@@ -44,8 +44,8 @@ def _panda() -> Cia402Arm:
     """A Panda's joints on CiA 402 drives with brakes, classic CAN at 1 Mbit/s.
 
     ASSUMED all: such an arm is not sold; the torques are the arm's efforts."""
-    limits = [(-166, 166, 2.17), (-101, 101, 2.17), (-166, 166, 2.17), (-176, -4, 2.17)]
-    limits += [(-166, 166, 2.61), (-1, 215, 2.61), (-166, 166, 2.61)]
+    limits = [(-166.003, 166.003, 2.17), (-101.001, 101.001, 2.17), (-166.003, 166.003, 2.17), (-176.001, -3.999, 2.17)]
+    limits += [(-166.003, 166.003, 2.61), (-1.003, 215.002, 2.61), (-166.003, 166.003, 2.61)]
     scales = (Scale(1 << 17, Fraction(100), torque) for torque in [87.0] * 4 + [12.0] * 3)
     joints = (_joint(*limit, brake=True, stop_ddq=5.0) for limit in limits)
     return Cia402Arm(tuple(joints), tuple(range(1, 8)), tuple(scales), revisions=(0x0002_0001,))

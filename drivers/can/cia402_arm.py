@@ -4,11 +4,13 @@ RPDO2 = controlword, mode of operation, torque offset goes in every cycle; with 
 position, torque offset where a position is commanded, RPDO3 = target velocity where a velocity is. All are taken over
 at the SYNC, so that mode and target change together. The torque offset 60B2h is the feed-forward of positions and
 velocities and, with a target torque of 0, the whole torque of the torque mode. Our heartbeat goes with every BEAT-th
-cycle.
+cycle. While axes are enabled or braked one of them a cycle is told what its brake has to do (60FEh), or asked what the
+contact of the brake tells (60FDh), in turn and by service data.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +21,7 @@ from canopen.sdo.exceptions import SdoError
 from asc_rt.core.types import CommandKind
 from drivers.base import Finding
 from drivers.can import cia402
-from drivers.can.arm import Emergency, Feedback, Heard, Heartbeat, Joint, Power, Target, Wish
+from drivers.can.arm import Brake, Emergency, Feedback, Heard, Heartbeat, Joint, Power, Target, Wish
 from drivers.can.bus_load import FrameSize
 from drivers.can.cia402 import Control, Mode, Nmt, PowerState, Scale, StatusFlag
 from drivers.can.dither import dithered
@@ -34,6 +36,8 @@ RPDO2_BASE, RPDO3_BASE = 0x300, 0x400
 RPDO2_MAP = (0x6040_0010, 0x6060_0008, 0x60B2_0010)
 RPDO3_MAP = (0x60FF_0020,)
 NOT_VALID = 1 << 31  # of a COB-ID: this PDO is off
+SDO_REQUEST, SDO_ANSWER, DOWNLOAD, UPLOAD, UPLOADED = 0x600, 0x580, 0x23, 0x40, 0x43  # of four bytes at once
+SET_BRAKE = 1 << 0  # of the digital outputs
 QUICK_STOP_AND_STAY, ON_LOSS_QUICK_STOP = 6, 3  # of 605Ah and 6007h
 WANTED_MODES = (Mode.CYCLIC_POSITION, Mode.CYCLIC_VELOCITY, Mode.CYCLIC_TORQUE)
 _MODES = {
@@ -51,17 +55,22 @@ class Cia402Arm:
     revisions: tuple[int, ...]  # of 1018h:03, known to be good
     bitrate: float = 1e6
     data_bitrate: float = 0.0
+    brake_contact: int | None = 16  # ASSUMED bit of the digital inputs 60FDh: closed; None: none tells
     heartbeat_ns: int = 50_000_000
     kinds: frozenset[CommandKind] = frozenset(CommandKind)
+
+    @property
+    def tells_brakes(self) -> bool:
+        return self.brake_contact is not None
 
     @property
     def resolution(self) -> float:
         return max(1.0 / abs(scale.counts_per_radian) for scale in self.scales)
 
     def budget(self) -> list[FrameSize]:
-        """Of positions, which take most."""
-        n = len(self.nodes)
-        return [FrameSize(8)] * (2 * n) + [FrameSize(5)] * n + [FrameSize(1), FrameSize(0)]
+        """Of positions and with a brake that is asked, which takes most."""
+        n, asked = len(self.nodes), 2 if self.tells_brakes else 0
+        return [FrameSize(8)] * (2 * n + asked) + [FrameSize(5)] * n + [FrameSize(1), FrameSize(0)]
 
     # --- a cycle -----------------------------------------------------------------------------------------------------
 
@@ -70,9 +79,26 @@ class Cia402Arm:
         for node, scale, target, told in zip(self.nodes, self.scales, targets, last, strict=True):
             if target.wish is not Wish.LOOK:
                 frames += self._command(seq, node, scale, target, told)
+        frames += self._ask_brake(seq, targets)
         if seq % BEAT == 0:
             frames.append(Frame(cia402.HEARTBEAT_BASE + MASTER, bytes([cia402.NodeState.OPERATIONAL])))
         return [*frames, Frame(cia402.SYNC_ID, b"")]
+
+    def _ask_brake(self, seq: int, targets: Sequence[Target]) -> list[Frame]:
+        """At most one frame, so that the load stays what `budget` says."""
+        asked = [i for i, target in enumerate(targets) if target.wish in (Wish.ENABLE, Wish.BRAKE)]
+        if not asked or not self.tells_brakes:
+            return []
+        turn, i = divmod(seq, len(asked))
+        close = SET_BRAKE if targets[asked[i]].wish is Wish.BRAKE else 0
+        write = struct.pack("<BHBI", DOWNLOAD, 0x60FE, 1, close)
+        data = struct.pack("<BHB4x", UPLOAD, 0x60FD, 0) if turn % 2 else write
+        return [Frame(SDO_REQUEST + self.nodes[asked[i]], data)]
+
+    def _brake(self, data: bytes) -> Brake:
+        if len(data) != 8 or self.brake_contact is None or data[:4] != struct.pack("<BHB", UPLOADED, 0x60FD, 0):
+            return Brake(None)
+        return Brake(bool(struct.unpack_from("<I", data, 4)[0] >> self.brake_contact & 1))
 
     def _command(self, seq: int, node: int, scale: Scale, target: Target, told: Feedback | None) -> list[Frame]:
         tau = dithered(target.tau, scale.rated_torque / 1000.0, 0.0, seq)
@@ -101,6 +127,8 @@ class Cia402Arm:
         match base:
             case cia402.TPDO1_BASE:
                 return i, _feedback(cia402.decode_actual(self.scales[i], frame.data))
+            case base if base == SDO_ANSWER:
+                return i, self._brake(frame.data)
             case cia402.HEARTBEAT_BASE:
                 return i, Heartbeat(cia402.decode_heartbeat(frame.data) is cia402.NodeState.OPERATIONAL)
             case cia402.EMCY_BASE:
@@ -143,6 +171,7 @@ class Cia402Arm:
         yield Finding(
             f"{name} scale", told == wanted, f"{told}, expected {wanted}", "set 608F, 6091, 6076 of the drive"
         )
+        yield _limits(name, node, scale, self.joints[i])
         modes = node[0x6502].raw
         missing = [mode.name for mode in WANTED_MODES if not modes >> (mode - 1) & 1]
         yield Finding(f"{name} modes", not missing, f"lacks {missing}" if missing else "cyclic ones", "another drive")
@@ -166,6 +195,8 @@ class Cia402Arm:
             (0x6007, 0): ON_LOSS_QUICK_STOP,
             (0x6071, 0): 0,
         }
+        if self.tells_brakes:
+            wanted[0x60FE, 2] = SET_BRAKE
         return _write(f"{name} settings", node, wanted)
 
     def guard(self, link: Link, i: int, watchdog_ns: int) -> Finding:
@@ -179,6 +210,19 @@ class Cia402Arm:
             return _write(f"axis {i + 1} watchdog", Service(link, self.nodes[i]), wanted)
         except (SdoError, SdoCommunicationError) as error:
             return Finding(f"axis {i + 1} watchdog", False, str(error), "the drive does not take its time-outs")
+
+
+def _limits(name: str, node: Service, scale: Scale, joint: Joint) -> Finding:
+    """The drive's software position limits equal the joint's to the count: the second line of defence of the arm."""
+    wanted = tuple(sorted((scale.counts(joint.q_min), scale.counts(joint.q_max))))
+    told = (node[0x607D][1].raw, node[0x607D][2].raw)
+    degrees = " to ".join(f"{math.degrees(q):.3f}" for q in sorted(map(scale.radians, told)))
+    return Finding(
+        f"{name} limits",
+        told == wanted,
+        f"607Dh is {told[0]} to {told[1]} counts ({degrees} deg), expected {wanted[0]} to {wanted[1]}",
+        f"set 607Dh:01 = {wanted[0]} and 607Dh:02 = {wanted[1]} in the drive, or correct the joint's range in arms.py",
+    )
 
 
 def _map(node: Service, communication: int, cob_id: int, entries: Sequence[int]) -> None:

@@ -104,6 +104,7 @@ class Can:
             pacing=Pacing.HOST,
             kinds=self._codec.kinds,
             period_ns=self._options.period_ns,
+            reach=(vector([j.q_min for j in self._codec.joints]), vector([j.q_max for j in self._codec.joints])),
             identity=f"{self._options.arm} on {self._options.interface} {self._options.channel}",
         )
 
@@ -210,6 +211,8 @@ class Can:
         stream = self._stream
         q, dq, tau = stream.pose()
         flags = RobotFlag.READY | RobotFlag.SERVO_ON
+        if stream.asks_to_slow:
+            flags |= RobotFlag.WARM
         if stream.found:
             flags = RobotFlag.FAULTED
             if any(found.fault is Fault.NO_VOLTAGE for found in stream.found):

@@ -10,7 +10,7 @@ from asc_rt.core.types import Vector
 from drivers.base import Finding
 from drivers.can.arm import Joint
 
-MARGIN = 0.1  # rad beyond the limits
+MARGIN = 0.1  # rad beyond the limits: no arm is there, its zero is wrong
 MOVED = math.radians(2.0)
 
 

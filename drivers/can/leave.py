@@ -20,6 +20,8 @@ from drivers.can.stream import Stream, hold, move
 SETTLE_S = 0.25  # after the path's end
 REST_SPEED = 0.05  # rad/s
 LONGEST_REST_S = 2.0
+DEAF = 3  # cycles: who has not answered for so long is not asked any more
+BRAKE_S = 0.3  # 0.2 for a brake to move, the rest for its contact to be asked in turn
 SHUTDOWN_S = 1.0  # for brakes to close and power to go off
 SAG = 0.02  # rad that a braked axis may give way without power
 
@@ -61,14 +63,15 @@ def _stands(stream: Stream) -> bool:
 
 
 def leave(stream: Stream, dynamics: Dynamics) -> None:
-    """Brakes first, then power, and only where there is a brake; then say so on the bus."""
+    """Brakes first, then power, and only where a brake tells that it is closed; then say so on the bus."""
     q = np.array([target.q for target in stream.targets])
-    braked = [joint.has_brake for joint in stream.codec.joints]
+    targets = hold(q, _weight(dynamics, q))
+    braked = _close_brakes(stream, targets)
     stream.expects_power = [on and not brake for on, brake in zip(stream.expects_power, braked, strict=True)]
     for _ in range(round(SHUTDOWN_S * 1e9 / stream.period_ns)):
         if not any(_has_power(stream, i) for i, brake in enumerate(braked) if brake):
             break
-        if not cycle(stream, _shutdown(q, _weight(dynamics, q), braked)):
+        if not cycle(stream, _wishing(targets, braked, Wish.DISABLE)):
             return
     sagged = [i for i, brake in enumerate(braked) if brake and abs(stream.pose()[0][i] - q[i]) > SAG]
     stream.found += [Found(Fault.BRAKE, i, stream.seq, "gives way without power") for i in sagged]
@@ -78,11 +81,30 @@ def leave(stream: Stream, dynamics: Dynamics) -> None:
         pass
 
 
-def _shutdown(q: Vector, tau: Vector, braked: list[bool]) -> list[Target]:
-    return [
-        replace(target, wish=Wish.DISABLE) if brake else target
-        for target, brake in zip(hold(q, tau), braked, strict=True)
-    ]
+def _close_brakes(stream: Stream, targets: list[Target]) -> list[bool]:
+    """Which axes their brakes hold. One whose brake does not say so within BRAKE_S keeps its power, and holds by it."""
+    braked = [joint.has_brake for joint in stream.codec.joints]
+    if not stream.codec.tells_brakes:
+        return braked
+    speaks = [missed < DEAF for missed in stream.missed]
+    asked = [brake and _has_power(stream, i) and speaks[i] for i, brake in enumerate(braked)]
+    for axis in stream.axes:
+        axis.brake_closed = None
+    for _ in range(round(BRAKE_S * 1e9 / stream.period_ns)):
+        if not _open(stream, asked) or not cycle(stream, _wishing(targets, asked, Wish.BRAKE)):
+            break
+    still = _open(stream, asked)
+    stream.found += [Found(Fault.BRAKE, i, stream.seq, "does not tell that it has closed") for i in still]
+    return [brake and i not in still for i, brake in enumerate(braked)]
+
+
+def _open(stream: Stream, asked: list[bool]) -> list[int]:
+    """Axes that have power, and whose brake has not said that it is closed."""
+    return [i for i, a in enumerate(asked) if a and _has_power(stream, i) and not stream.axes[i].brake_closed]
+
+
+def _wishing(targets: list[Target], which: list[bool], wish: Wish) -> list[Target]:
+    return [replace(target, wish=wish) if these else target for target, these in zip(targets, which, strict=True)]
 
 
 def _has_power(stream: Stream, i: int) -> bool:

@@ -46,6 +46,7 @@ class MitArm:
     data_bitrate: float
     heartbeat_ns: int = 0
     kinds: frozenset[CommandKind] = frozenset(CommandKind)
+    tells_brakes: bool = False
 
     @property
     def resolution(self) -> float:

@@ -12,8 +12,9 @@ from enum import Enum, StrEnum
 
 class Reaction(Enum):
     WARN = 0  # counted and told
-    STOP = 1  # coordinated stop of every axis that listens, on the path; then hold, and transmit on
-    CUT = 2  # nothing can be said on the bus any more: the drives' own watchdogs and the power circuit stop the arm
+    SLOW = 1  # told to the core, which goes on at its slow speed for as long as it is seen
+    STOP = 2  # coordinated stop of every axis that listens, on the path; then hold, and transmit on
+    CUT = 3  # nothing can be said on the bus any more: the drives' own watchdogs and the power circuit stop the arm
 
 
 class Fault(StrEnum):
@@ -33,6 +34,7 @@ class Fault(StrEnum):
     ENCODER = "encoder jump"
     FOLLOWING = "following error"
     WARM = "drive warm"
+    HEATED = "drive needs rest"
     HOT = "drive hot"
     STRANGERS = "unknown frames"
     FLOOD = "too many unknown frames"
@@ -68,12 +70,16 @@ RULES = {
     Fault.ENCODER: Rule(Reaction.STOP, "check the zero of the axis before anything moves"),
     Fault.FOLLOWING: Rule(Reaction.STOP, "something holds the arm, or a brake is closed"),
     Fault.WARM: Rule(Reaction.WARN, "let it cool soon", is_axis=False),
+    Fault.HEATED: Rule(Reaction.SLOW, "let the drive cool down: it goes slowly until then", is_axis=False),
     Fault.HOT: Rule(Reaction.STOP, "let the drive cool down: it would go limp by itself", is_axis=False),
     Fault.STRANGERS: Rule(Reaction.WARN, "somebody else sends on this bus", is_axis=False),
     Fault.FLOOD: Rule(Reaction.STOP, "somebody else sends on this bus: take it off", is_axis=False),
     Fault.LATE: Rule(Reaction.WARN, "asc doctor: is this PC fit for the period?", is_axis=False),
     Fault.OVERRUN: Rule(Reaction.STOP, "this PC is too slow or busy: asc doctor", is_axis=False),
-    Fault.BRAKE: Rule(Reaction.STOP, "support the arm; the brake must be serviced"),
+    Fault.BRAKE: Rule(
+        Reaction.STOP,
+        "support the arm before its power goes; brake or contact must be serviced",
+    ),
 }
 
 

@@ -23,6 +23,7 @@ REHEARSAL = 50  # cycles before anything is enabled
 LOSSES = 2  # answers of one axis that may be lost meanwhile
 SETTLE = 15  # cycles
 ENABLE_CYCLES = 25  # for one axis
+BRAKE_S = 0.3  # for its brake to open, and to tell so
 SEED = 0.005  # rad between two looks at an arm that stands still
 SAG = 0.05  # rad that the arm may give way when it is enabled
 
@@ -164,15 +165,19 @@ def _seed(stream: Stream) -> Vector:
 
 def _enable_axis(stream: Stream, i: int, q: Vector, dynamics: Dynamics) -> Finding:
     """The axes before it hold, those after it stay as they are."""
-    for _ in range(ENABLE_CYCLES):
+    axis, tells = stream.axes[i], stream.codec.tells_brakes and stream.codec.joints[i].has_brake
+    axis.brake_closed = None
+    for _ in range(ENABLE_CYCLES + (round(BRAKE_S * 1e9 / stream.period_ns) if tells else 0)):
         targets = hold(q, _weight(dynamics, q))
         targets[i] = hold(q, _weight(dynamics, q), Wish.ENABLE)[i]
         _cycle(stream, targets)
-        if stream.powers()[i] is Power.ENABLED:
+        if stream.powers()[i] is Power.ENABLED and (not tells or axis.brake_closed is False):
             stream.expects_power[i] = True
-            return Finding(f"enable axis {i + 1}", True, "enabled")
-    told = stream.axes[i].feedback
-    detail = f"stays {told.words if told else 'silent'}"
+            return Finding(f"enable axis {i + 1}", True, "enabled" + (", its brake is open" if tells else ""))
+    if stream.powers()[i] is Power.ENABLED:
+        detail = "its brake does not tell that it has opened"
+        return _checked(Finding(f"brake of axis {i + 1}", False, detail, "check the brake, its supply and its contact"))
+    detail = f"stays {axis.feedback.words if axis.feedback else 'silent'}"
     return _checked(Finding(f"enable axis {i + 1}", False, detail, "check power and the emergency stop circuit"))
 
 

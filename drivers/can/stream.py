@@ -12,7 +12,7 @@ import numpy as np
 
 from asc_rt.core.types import CommandKind, Vector, vector
 from drivers.base import ProtocolError, WireTap
-from drivers.can.arm import ArmCodec, Emergency, Feedback, Heartbeat, Power, Target, Wish
+from drivers.can.arm import ArmCodec, Brake, Emergency, Feedback, Heartbeat, Power, Target, Wish
 from drivers.can.frame import Frame, bundle
 from drivers.can.link import Link
 from drivers.can.reactions import Fault, Found, Reaction
@@ -44,6 +44,7 @@ class Stream:
         self.expects_power = [False] * n
         self.counters = Counters()
         self.found: list[Found] = []
+        self.asks_to_slow = False  # since the newest cycle was judged
         self.seq = 0
         self.t_rx_ns = 0  # key of the newest sample in the record
         self.targets: Sequence[Target] = ()
@@ -131,6 +132,8 @@ class Stream:
                 self._take(i, what, frame, now_ns)
             case Heartbeat():
                 self.axes[i].beat_ns = now_ns
+            case Brake():
+                self.axes[i].brake_closed = self.axes[i].brake_closed if what.closed is None else what.closed
             case Emergency():
                 self.axes[i].emergency = what.words or self.axes[i].emergency
                 self._tap_alone(frame, now_ns)
@@ -149,7 +152,7 @@ class Stream:
         self._newest[i], self.t_rx_ns = frame, now_ns
         if told.hottest_c is not None:
             self.counters.worst_c = max(self.counters.worst_c, told.hottest_c)
-        for found in self._watch.moved(i, before, axis, self.seq):
+        for found in self._watch.moved(i, before, axis, elapsed, self.seq):
             self._note(found)
 
     def _elapsed(self, axis: AxisState, frame: Frame, now_ns: int) -> float:
@@ -172,7 +175,7 @@ class Stream:
         self._tap_alone(frame, now_ns)
 
     def _judge(self) -> None:
-        now_ns = self.link.now_ns()
+        now_ns, self.asks_to_slow = self.link.now_ns(), False
         if (silent := min(self.missed)) >= SILENT:
             self._note(Found(Fault.SILENT, None, self.seq, f"{silent} cycles"))
         for found in self._watch.bus(self.link.health, self.seq, now_ns):
@@ -192,7 +195,8 @@ class Stream:
 
     def _note(self, found: Found) -> None:
         self.counters.found[found.fault] = self.counters.found.get(found.fault, 0) + 1
-        if found.rule.reaction is Reaction.WARN:
+        self.asks_to_slow |= found.rule.reaction is Reaction.SLOW
+        if found.rule.reaction in (Reaction.WARN, Reaction.SLOW):
             return
         if all((found.fault, found.axis) != (known.fault, known.axis) for known in self.found):
             self.found.append(found)

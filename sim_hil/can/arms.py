@@ -34,7 +34,12 @@ def _mit(motors: Sequence[dict[str, float]]) -> Callable[[bool], Sequence[Drive]
 
 def _panda(nasty: bool) -> Sequence[Drive]:
     joints = [(87.0, 2000.0, 60.0)] * 2 + [(87.0, 1000.0, 15.0)] * 2 + [(12.0, 150.0, 1.5)] * 3
-    return [Cia402Drive(1 + i, Data(*joint, serial=2000 + i, holds=not nasty)) for i, joint in enumerate(joints)]
+    limits = [(-166.003, 166.003), (-101.001, 101.001), (-166.003, 166.003), (-176.001, -3.999)]
+    limits += [(-166.003, 166.003), (-1.003, 215.002), (-166.003, 166.003)]
+    return [
+        Cia402Drive(1 + i, Data(*joint, limits_deg=limits[i], serial=2000 + i, holds=not nasty))
+        for i, joint in enumerate(joints)
+    ]
 
 
 ARMS = {

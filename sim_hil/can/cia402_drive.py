@@ -19,7 +19,8 @@ BOOT, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 POSITION, VELOCITY, TORQUE = 8, 9, 10
 WARM_C, TRIP_C = 85.0, 110.0  # deg C, ASSUMED
 RAMP_S = 0.2  # s of a quick stop, ASSUMED
-BRAKE_NS = 150_000_000  # torque stays on so long after the brake has begun to close
+BRAKE_NS = 50_000_000  # from the order to its contact, ASSUMED
+BRAKE_OUTPUT, BRAKE_CONTACT = 1 << 0, 1 << 16  # of the digital outputs and inputs
 EMCY = {"heartbeat": 0x8130, "rpdo": 0x8250, "current": 0x2310, "hot": 0x4310, "follow": 0x8611}
 NO_OBJECT, READ_ONLY = 0x0602_0000, 0x0601_0002
 
@@ -27,7 +28,7 @@ _FORMATS = {
     0x1001: "<B", 0x1017: "<H", 0x6007: "<h", 0x603F: "<H", 0x6040: "<H", 0x6041: "<H", 0x605A: "<h", 0x6060: "<b",
     0x6061: "<b", 0x6064: "<i", 0x6071: "<h", 0x6077: "<h", 0x607A: "<i", 0x60B2: "<h", 0x60FF: "<i",
 }  # fmt: skip
-_WRITABLE = {0x1016, 0x1017, 0x6007, 0x6040, 0x605A, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C2, 0x60FF}
+_WRITABLE = {0x1016, 0x1017, 0x6007, 0x6040, 0x605A, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C2, 0x60FE, 0x60FF}
 
 
 @dataclass(slots=True)
@@ -39,6 +40,7 @@ class Data:
     kd: float  # Nms/rad
     resolution: int = 1 << 17
     gear: tuple[int, int] = (100, 1)
+    limits_deg: tuple[float, float] = (-360.0, 360.0)  # it lets no position target go beyond
     serial: int = 1
     revision: int = 0x0002_0001
     holds: bool = True
@@ -48,15 +50,18 @@ class Cia402Drive:
     def __init__(self, node: int, data: Data) -> None:
         self.node, self.data = node, data
         self.state, self.nmt = DISABLED, PRE_OPERATIONAL
-        self.coil_c, self.offset, self.age = 30.0, 0.0, 0.0
-        self.is_silent = self.heart_stopped = False
+        self.coil_c, self.age = 30.0, 0.0
+        self.offset = self.drift = 0.0  # rad that the encoder is off; rad/s
+        self.is_silent = self.heart_stopped = self.is_deaf = False
         self.voltage = True
-        self.brake_stuck_open = False
+        self.brake_stuck: bool | None = None  # closed or open, whatever it is told
+        self.contact_stuck: bool | None = None  # what its contact tells, whatever it does
         self.q = self.dq = self.tau = 0.0
         self._od = _objects(node, data)
         self._staged: dict[int, bytes] = {}
         self._say: list[Frame] = []
-        self._master_ns = self._beat_ns = self._brake_ns = 0
+        self._master_ns = self._beat_ns = self._settled_ns = 0
+        self._contact = True
         self._rpdo_ns = [0] * 4
         self._ramp: tuple[float, float, float] | None = None  # q, dq, seconds of a quick stop
         self._last_target = 0.0
@@ -68,7 +73,10 @@ class Cia402Drive:
 
     @property
     def brake_closed(self) -> bool:
-        return self.state not in (ENABLED, QUICK_STOP) and not self.brake_stuck_open
+        if self.brake_stuck is not None:
+            return self.brake_stuck
+        ordered = self._od[0x60FE, 1] & self._od[0x60FE, 2] & BRAKE_OUTPUT
+        return self.state not in (ENABLED, QUICK_STOP) or bool(ordered)
 
     # --- the wire ------------------------------------------------------------------------------------------------
 
@@ -115,7 +123,8 @@ class Cia402Drive:
             self._refresh()
             answer = [Frame(self._od[0x1800, 1], self._gather(0x1A00))]
         for mapping, data in sorted(self._staged.items()):
-            self._scatter(mapping, data)
+            if not self.is_deaf:
+                self._scatter(mapping, data)
         self._staged.clear()
         self._control(self._od[0x6040, 0])
         return answer
@@ -124,10 +133,13 @@ class Cia402Drive:
         q = self.q + self.dq * self.age + self.offset
         self._od[0x6064, 0] = _wrap(round(q * self._counts()), 32)
         self._od[0x6077, 0] = _wrap(round(self.tau / self.data.rated * 1000), 16)
-        follows = FOLLOWS if self.state == ENABLED and self._od[0x6060, 0] in (POSITION, VELOCITY, TORQUE) else 0
+        hears = self._od[0x6060, 0] in (POSITION, VELOCITY, TORQUE) and not self.is_deaf
+        follows = FOLLOWS if self.state == ENABLED and hears else 0
         warm = WARNING if self.coil_c >= WARM_C else 0
         self._od[0x6041, 0] = self.state | REMOTE | follows | warm | (VOLTAGE if self.voltage else 0)
         self._od[0x6061, 0] = self._od[0x6060, 0]
+        contact = self._contact if self.contact_stuck is None else self.contact_stuck
+        self._od[0x60FD, 0] = BRAKE_CONTACT if contact else 0
 
     def _entries(self, mapping: int) -> list[tuple[int, int, int]]:
         """(index, sub, bytes) of what is mapped."""
@@ -212,11 +224,29 @@ class Cia402Drive:
     def trip_over_current(self) -> None:
         self._fail(EMCY["current"])
 
+    def say_emergency(self, code: int) -> None:
+        self._emergency(code)
+
+    def stop_by_itself(self) -> None:
+        self._begin_stop()
+
+    def jam_brake(self, closed: bool, contact: bool) -> None:
+        if contact:
+            self.contact_stuck = closed
+        else:
+            self.brake_stuck = closed
+
+    def ignore_targets(self) -> None:
+        self.is_deaf = True
+
     def switch_off(self) -> None:
         self.state = DISABLED
 
     def tick(self, q: float, dq: float, elapsed_ns: int) -> float:
         self.q, self.dq = q, dq
+        self.offset += self.drift * elapsed_ns * 1e-9
+        self._settled_ns = self._settled_ns + elapsed_ns if self.brake_closed != self._contact else 0
+        self._contact ^= self._settled_ns >= BRAKE_NS
         self._master_ns += elapsed_ns
         self._rpdo_ns = [age_ns + elapsed_ns for age_ns in self._rpdo_ns]
         if self.state == ENABLED and self.nmt == OPERATIONAL:
@@ -244,7 +274,8 @@ class Cia402Drive:
             self._last_target = self.q
             return self._od[0x6071, 0] / 1000 * d.rated + offset
         if self.state == ENABLED and self._od[0x6060, 0] == POSITION:
-            target = self._od[0x607A, 0] / self._counts() - self.offset
+            counts = min(max(self._od[0x607A, 0], self._od[0x607D, 1]), self._od[0x607D, 2])
+            target = counts / self._counts() - self.offset
             return d.kp * (target - self.q) - d.kd * self.dq + offset
         if self.state == ENABLED and self._od[0x6060, 0] == VELOCITY:
             self._last_target = self.q
@@ -266,10 +297,13 @@ class Cia402Drive:
 
 def _objects(node: int, d: Data) -> dict[tuple[int, int], int]:
     od = {(index, 0): 0 for index in _FORMATS}
+    od |= {(0x60FD, 0): 0, (0x60FE, 0): 2, (0x60FE, 1): 0, (0x60FE, 2): 0}
     od |= {(0x1000, 0): 0x0002_0192, (0x6502, 0): 0x380, (0x6076, 0): round(d.rated * 1000)}
     od |= {(0x1016, 0): 1, (0x1016, 1): 0, (0x1018, 0): 4, (0x1018, 1): 0x1234, (0x1018, 2): 7}
     od |= {(0x1018, 3): d.revision, (0x1018, 4): d.serial, (0x605A, 0): 2, (0x6007, 0): 1}
     od |= {(0x608F, 0): 2, (0x608F, 1): d.resolution, (0x608F, 2): 1, (0x6091, 0): 2}
+    least, greatest = (round(deg / 360 * d.resolution * d.gear[0] / d.gear[1]) for deg in d.limits_deg)
+    od |= {(0x607D, 0): 2, (0x607D, 1): least, (0x607D, 2): greatest}
     od |= {(0x6091, 1): d.gear[0], (0x6091, 2): d.gear[1], (0x60C2, 0): 2, (0x60C2, 1): 1, (0x60C2, 2): -3}
     for k in range(4):  # as they come from the factory: the spare ones are on
         od |= {(0x1400 + k, 0): 5, (0x1400 + k, 1): 0x200 + 0x100 * k + node, (0x1400 + k, 2): 255}
@@ -284,7 +318,7 @@ def _objects(node: int, d: Data) -> dict[tuple[int, int], int]:
 def _size(index: int, sub: int) -> int:
     if index in _FORMATS:
         return struct.calcsize(_FORMATS[index])
-    if sub == 0 and index not in (0x1000, 0x6502, 0x6076):
+    if sub == 0 and index not in (0x1000, 0x6502, 0x6076, 0x60FD):
         return 1
     if index == 0x60C2 or (index >> 8 in (0x14, 0x18) and sub in (2, 4)):
         return 1
@@ -292,7 +326,7 @@ def _size(index: int, sub: int) -> int:
 
 
 def _signed(index: int, sub: int = 0) -> bool:
-    return _FORMATS.get(index, "<I")[1].islower() or (index == 0x60C2 and sub == 2)
+    return _FORMATS.get(index, "<I")[1].islower() or (index == 0x60C2 and sub == 2) or (index == 0x607D and sub > 0)
 
 
 def _wrap(value: int, bits: int) -> int:

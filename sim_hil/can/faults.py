@@ -5,7 +5,8 @@ Script entries: {at_s, fault, axis?, value?}; `axis` counts from 1, 0 is every a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,6 +29,10 @@ def _echo(line: Line, i: int, value: float) -> None:
     line.echo.add(i)
 
 
+def _short(line: Line, i: int, value: float) -> None:
+    line.short.add(i)
+
+
 def _silence(line: Line, i: int, value: float) -> None:
     line.drives[i].is_silent = True
 
@@ -48,6 +53,30 @@ def _safe_torque_off(line: Line, i: int, value: float) -> None:
 
 def _trip(line: Line, i: int, value: float) -> None:
     line.drives[i].trip_over_current()
+
+
+def _emergency(line: Line, i: int, value: float) -> None:
+    line.drives[i].say_emergency(round(value))
+
+
+def _stops(line: Line, i: int, value: float) -> None:
+    line.drives[i].stop_by_itself()
+
+
+def _deaf(line: Line, i: int, value: float) -> None:
+    line.drives[i].ignore_targets()
+
+
+def _brake(line: Line, i: int, value: float) -> None:
+    line.drives[i].jam_brake(value > 0, contact=False)
+
+
+def _contact(line: Line, i: int, value: float) -> None:
+    line.drives[i].jam_brake(value > 0, contact=True)
+
+
+def _drift(line: Line, i: int, value: float) -> None:
+    line.drives[i].drift = value
 
 
 def _disable(line: Line, i: int, value: float) -> None:
@@ -86,13 +115,20 @@ FAULTS: dict[str, Action] = {
     "lose": _lose,  # value: frames of the drive
     "late": _late,  # value: ms
     "echo": _echo,
+    "short": _short,
     "silence": _silence,
     "heartbeat": _heartbeat,
     "power_cut": _power_cut,
     "safe_torque_off": _safe_torque_off,
     "trip": _trip,
+    "emergency": _emergency,  # value: code of the EMCY
+    "stops": _stops,
+    "deaf": _deaf,
+    "brake": _brake,  # value: 1 stays closed, 0 open
+    "contact": _contact,  # value: 1 tells closed, 0 open
     "disable": _disable,
     "encoder": _encoder,  # value: rad
+    "drift": _drift,  # value: rad/s
     "block": _block,
     "hot": _hot,  # value: deg C
     "corrupt": _corrupt,  # value: frames
@@ -114,18 +150,40 @@ class Fault:
         if not isinstance(entry, dict) or not {"at_s", "fault"} <= set(entry) <= set(_KEYS):
             raise ValueError(f"a fault is a table with {', '.join(_KEYS)}, not {entry!r}")
         fault = cls(**entry)
-        numbers = all(type(n) in (int, float) for n in (fault.at_s, fault.value)) and type(fault.axis) is int
-        if fault.fault not in FAULTS or not numbers or fault.at_s < 0 or fault.axis < 0:
-            raise ValueError(f"{entry} is no fault; faults: {', '.join(FAULTS)}")
+        if not isinstance(fault.fault, str) or fault.fault not in FAULTS:
+            raise ValueError(f"{fault.fault!r} is no fault; faults: {', '.join(FAULTS)}")
+        if not (_is_number(fault.at_s) and fault.at_s >= 0):
+            raise ValueError(f"at_s: {fault.at_s!r} is no time; seconds from the first client on, at least 0")
+        if type(fault.axis) is not int or fault.axis < 0:
+            raise ValueError(f"axis: {fault.axis!r} is no axis; they count from 1, 0 is every one")
+        low, high = _VALUES.get(fault.fault, (-math.inf, math.inf))
+        if not (_is_number(fault.value) and low <= fault.value <= high):
+            raise ValueError(
+                f"value: {fault.value!r} is not possible; of {fault.fault!r} a number from {low:g} to {high:g}"
+            )
         return fault
 
     def strike(self, line: Line) -> None:
-        """IndexError: there is no such axis."""
+        """IndexError: there is no such axis, see `check_axes`."""
         axes = range(len(line.drives)) if self.axis == 0 else [self.axis - 1]
         for i in axes if self.fault not in _OF_THE_BUS else [0]:
             FAULTS[self.fault](line, i, self.value)
 
 
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+
+
+def check_axes(script: Sequence[Fault], axes: int) -> None:
+    """ValueError: faults of axes that this arm does not have."""
+    wrong = [f"fault {fault.fault!r}: axis {fault.axis} of {axes}" for fault in script if fault.axis > axes]
+    if wrong:
+        raise ValueError("\n".join(wrong))
+
+
+# What else would be no frame, or no number of frames.
+_VALUES = {"lose": (0, 1e6), "corrupt": (0, 1e6), "late": (0, 1e3), "babble": (0, 0x7FF), "emergency": (0, 0xFFFF)}
+_VALUES["hot"] = (0, 255)  # as much as the answer has bits for
 _OF_THE_BUS = ("corrupt", "unplug", "babble")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -25,12 +26,23 @@ class Drive(Protocol):
 
     age: float  # s since its last tick: an encoder is read when it is asked
     offset: float  # rad that the encoder is off
+    drift: float  # rad/s by which that grows
     coil_c: float  # deg C
     is_silent: bool  # it hears, but its transceiver is dead
     heart_stopped: bool  # its cyclic answers go on, its heartbeat does not
 
     def cut_power(self) -> None: ...
     def trip_over_current(self) -> None: ...
+    def say_emergency(self, code: int) -> None:
+        """And go on as if nothing were."""
+
+    def stop_by_itself(self) -> None: ...
+    def jam_brake(self, closed: bool, contact: bool) -> None:
+        """It, or its contact only, stays so."""
+
+    def ignore_targets(self) -> None:
+        """And tell so."""
+
     def switch_off(self) -> None:
         """As if told to by a stranger."""
 
@@ -55,7 +67,8 @@ class Mechanics(Protocol):
 class Line:
     """Drive i turns joint i of the mechanics; drives beyond the joints turn nothing (a duplicate on the bus).
 
-    Faults of the wire, by drive: `lose` so many of its frames, `late` so many ns on every answer, `echo` twice.
+    Faults of the wire, by drive: `lose` so many of its frames, `late` so many ns on every answer, `echo` twice, `short`
+    of the last byte.
     """
 
     def __init__(self, drives: Sequence[Drive], mechanics: Mechanics, bus: Bus | None = None) -> None:
@@ -64,6 +77,7 @@ class Line:
         self.lose: Counter[int] = Counter()
         self.late: dict[int, int] = {}
         self.echo: set[int] = set()
+        self.short: set[int] = set()
         self.babble: Frame | None = None  # said by a stranger after each tick
         self.on_stand = False  # a stand carries the arm until every drive has power
         self.gone = False  # the interface of every client is unplugged
@@ -144,5 +158,7 @@ class Line:
         for frame in frames * (2 if i in self.echo else 1):
             if self.lose[i] > 0:
                 self.lose[i] -= 1
-            else:
-                self.bus.submit(FIRST_DRIVE + i, frame, t_ns + self.late.get(i, 0))
+                continue
+            if i in self.short:
+                frame = replace(frame, data=frame.data[:-1])
+            self.bus.submit(FIRST_DRIVE + i, frame, t_ns + self.late.get(i, 0))

@@ -41,7 +41,8 @@ class MitDrive:
         self.settings = settings or Settings()
         self.command_id, self.answer_id = command_id, answer_id
         self.state = DISABLED
-        self.coil_c, self.offset, self.age = 30.0, 0.0, 0.0  # deg C; rad that the encoder is off; s since the tick
+        self.coil_c, self.age = 30.0, 0.0  # deg C; s since the tick
+        self.offset = self.drift = 0.0  # rad that the encoder is off; rad/s
         self.is_silent = self.heart_stopped = False  # this kind of drive has no heartbeat
         self.q = self.dq = self.tau = 0.0
         self._target: tuple[float, float, float, float, float] | None = None  # q dq kp kd tau
@@ -134,6 +135,18 @@ class MitDrive:
     def trip_over_current(self) -> None:
         self.trip(OVER_CURRENT)
 
+    def say_emergency(self, code: int) -> None:
+        """This kind of drive has no such message."""
+
+    def stop_by_itself(self) -> None:
+        """It has no such state."""
+
+    def jam_brake(self, closed: bool, contact: bool) -> None:
+        """There is none."""
+
+    def ignore_targets(self) -> None:
+        """It has no such flag."""
+
     def switch_off(self) -> None:
         self.trip(DISABLED)
 
@@ -144,6 +157,7 @@ class MitDrive:
     def tick(self, q: float, dq: float, elapsed_ns: int) -> float:
         """Torque of the coming tick, Nm, at the joint's true q and dq."""
         self.q, self.dq = q, dq
+        self.offset += self.drift * elapsed_ns * 1e-9
         self._quiet_ns += elapsed_ns
         limit_ns = self.settings.timeout * 50_000
         if self.state == ENABLED and limit_ns and self._quiet_ns > limit_ns:

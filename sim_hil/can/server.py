@@ -31,7 +31,7 @@ from asc_rt.bus import BusError
 from asc_rt.config import Cell, ConfigError, load_cell
 from sim_hil.can.arms import ARMS
 from sim_hil.can.bus import Bus, Delivery
-from sim_hil.can.faults import Fault, due, heard, parse_script, read_script
+from sim_hil.can.faults import Fault, check_axes, due, heard, parse_script, read_script
 from sim_hil.can.frames import Frame, pack, unpack
 from sim_hil.can.line import TICK_NS, Line
 from sim_hil.can.plugin import MAX_RECORD, STAMP, address, is_for, refusal
@@ -91,12 +91,21 @@ class Server:
             for fault in due(script, (now_ns - began_ns) * 1e-9 if began_ns else -1.0):
                 fault.strike(self.line)
             for fault in heard(take_fault):
-                fault.strike(self.line)
+                self._strike(fault)
             if now_ns - self.line.now_ns > LONGEST_PAUSE_NS:
                 self.line.begin(now_ns - LONGEST_PAUSE_NS)
             self._take(self._heard(readable))
             self._tell(partial(self.line.advance, now_ns))
             self._tell(self.line.settle)
+
+    def _strike(self, fault: Fault) -> None:
+        """What came over the bus; a mistake in there is told, and ends nothing."""
+        try:
+            check_axes([fault], len(self.line.drives))
+        except ValueError as wrong:
+            print(wrong, file=sys.stderr, flush=True)
+            return
+        fault.strike(self.line)
 
     def close(self) -> None:
         for client in self._clients.values():
@@ -171,6 +180,7 @@ def main(argv: list[str]) -> int:
             table = _table(cell)
             script = parse_script(table.get("faults", []), "sim.can")
             script += read_script(args.faults) if args.faults else []
+            check_axes(script, cell.params.n)
             server, world = _server(cell, table, stack)
         except (ConfigError, ValueError) as failed:
             return _fail(failed, 2)

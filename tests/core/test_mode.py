@@ -171,6 +171,19 @@ def test_cut_off_when_nobody_would_hear_a_set_point(bench: Any, reason: StopReas
     assert not cut_off(in_mode(bench, M.ACTIVE, reason))
 
 
+def test_a_robot_that_asks_for_rest_goes_slowly_and_stops_for_nothing_of_it(bench: Any) -> None:
+    warm = replace(bench.joint(bench.HOME), flags=bench.FINE | RobotFlag.WARM)
+    state = decide(bench, in_mode(bench, M.ACTIVE), joint=warm)
+    assert (state.mode, state.reason, state.slow) == (M.ACTIVE, R.NONE, R.ROBOT_WARM)
+    unheard = decide(bench, state, joint=None)
+    assert unheard.slow is R.ROBOT_WARM, "silence says nothing of its temperature"
+    degraded = replace(bench.FAR, health=Health.DEGRADED)
+    assert decide(bench, state, joint=warm, human=degraded).slow is R.ROBOT_WARM
+    assert decide(bench, state, human=degraded).slow is R.HUMAN_UNHEALTHY
+    assert decide(bench, state).slow is R.NONE
+    assert decide(bench, in_mode(bench, M.ACTIVE), joint=None).slow is R.NONE
+
+
 def test_only_arm_leads_to_active(bench: Any) -> None:
     rng = np.random.default_rng(0)
     table = [changes for reason in causes(bench).values() for changes in reason] + [{}] * 20 + [{"joint": None}]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from typing import cast
 
 import pytest
 from hypothesis import given
@@ -11,7 +12,12 @@ from hypothesis import strategies as st
 
 from drivers.base import ProtocolError
 from drivers.can import cia402
+from drivers.can.arm import Brake, Wish
+from drivers.can.arms import ARMS
 from drivers.can.cia402 import Control, Mode, Nmt, NodeState, PowerState, Scale, StatusFlag, Target
+from drivers.can.cia402_arm import Cia402Arm
+from drivers.can.frame import Frame
+from drivers.can.stream import hold, look
 
 SCALE = Scale(resolution=4096, gear=Fraction(101), rated_torque=12.0)
 TURN = 4096 * 101
@@ -99,6 +105,32 @@ def test_any_bytes_give_values_or_a_protocol_error(data: bytes) -> None:
             decode()
         except ProtocolError:
             continue
+
+
+def test_brakes_are_told_and_asked_in_turn_one_frame_a_cycle() -> None:
+    arm = cast(Cia402Arm, ARMS["panda"])
+    most = sum(frame.length for frame in arm.budget())
+    for wish, close in ((Wish.BRAKE, 1), (Wish.ENABLE, 0)):
+        said = []
+        for seq in range(14):
+            frames = arm.encode(seq, hold([0.0] * 7, [0.0] * 7, wish), [None] * 7)
+            said += [frame for frame in frames if 0x600 <= frame.id < 0x680]
+            answered = 7 * 8 + 8  # TPDOs, and what the drive says to it
+            assert sum(len(frame.data) for frame in frames) + answered <= most
+        assert [frame.id for frame in said] == 2 * [0x601 + i for i in range(7)]
+        assert {frame.data.hex() for frame in said[:7]} == {f"23fe6001{close:02x}000000"}
+        assert {frame.data.hex() for frame in said[7:]} == {"40fd600000000000"}
+    assert not [frame for frame in arm.encode(0, look(7), [None] * 7) if 0x600 <= frame.id < 0x680]
+
+
+@pytest.mark.parametrize(
+    ("data", "closed"),
+    [("43fd600000000100", True), ("43fd60000000feff", False), ("43fd600000000000", False), ("60fe600100000000", None),
+     ("80fd600000000206", None), ("43fd600100000100", None), ("43fd6000000001", None), ("", None)],
+)  # fmt: skip
+def test_what_a_brake_tells(data: str, closed: bool | None) -> None:
+    """Bit 16 of the digital inputs; a refusal, the answer to an order, or another object says nothing of it."""
+    assert ARMS["panda"].decode(Frame(0x583, bytes.fromhex(data))) == (2, Brake(closed))
 
 
 def test_node_control_and_its_news() -> None:

@@ -168,6 +168,28 @@ def test_a_drive_that_fails_in_motion_ends_the_session_and_the_rest_of_the_arm_s
 
 
 @pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
+def test_a_hot_drive_slows_the_arm_down_until_it_has_cooled(name: str) -> None:
+    session = Session(name)
+    task, dq_max = session.system.params.task, session.system.bounds.dq_max
+    goal = Goal(1, vector(session.q0 + np.radians([60, 0, 0, 0, 0, 0, 0])))
+    session.run(20)
+    session.run(60, goal, arm=True)
+    slow = 1.05 * min(task.speed, task.slow_speed) * dq_max[0]
+
+    def speed() -> float:
+        return float(session.rig.line.mechanics.dq[0])
+
+    assert speed() > 1.5 * slow
+    session.rig.strike("hot", 7, 86.0)
+    session.run(120, goal)
+    assert session.state.mode is Mode.ACTIVE and session.state.slow is StopReason.ROBOT_WARM
+    assert 0.5 * slow < speed() <= slow
+    session.rig.strike("hot", 7, 50.0)
+    session.run(40, goal)
+    assert session.state.slow is StopReason.NONE and speed() > 1.5 * slow
+
+
+@pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
 @pytest.mark.parametrize(
     ("seconds", "seed"), [(15.0, 1), *[pytest.param(60.0, seed, marks=LONG) for seed in range(2, 6)]]
 )

@@ -19,6 +19,7 @@ from can_through import has_vcan
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, Vector, vector
 from drivers.base import RobotFaulted
+from drivers.can import arms
 from drivers.can.arm import Power
 from drivers.can.reactions import RULES, Fault, Reaction
 
@@ -53,10 +54,16 @@ ROWS = {
     "gone": Row(Fault.INTERFACE_GONE, lambda rig: setattr(rig.line, "gone", True), 2, sick=()),
     "backlog": Row(Fault.BACKLOG, lambda rig: setattr(rig.line, "full", 3), 2, sick=()),
     "drive fault": Row(Fault.AXIS_FAULT, once("trip"), 2),
+    "emergency": Row(Fault.AXIS_FAULT, once("emergency", 0x7305), 2, arms=("panda",)),
+    "stops by itself": Row(Fault.AXIS_FAULT, once("stops"), 2, arms=("panda",)),
+    "deaf": Row(Fault.DISABLED, once("deaf"), 2, arms=("panda",)),
+    "wrong length": Row(Fault.STALE, once("short"), 4),
     "disabled": Row(Fault.DISABLED, once("disable"), 2),
     "safe torque off": Row(Fault.NO_VOLTAGE, once("safe_torque_off", axis=0), 2, sick=tuple(range(7))),
     "encoder": Row(Fault.ENCODER, once("encoder", 0.2), 2),
+    "slip": Row(Fault.ENCODER, once("drift", 2.5), 4, arms=("openarm",)),  # the other tells no speed to compare with
     "blocked": Row(Fault.FOLLOWING, once("block"), 60, only_moving=True),
+    "brake closes": Row(Fault.FOLLOWING, once("brake"), 60, only_moving=True, arms=("panda",)),
     "heartbeat": Row(Fault.HEARTBEAT, once("heartbeat"), 52, sick=(), arms=("panda",)),
     "hot": Row(Fault.HOT, once("hot", 96.0), 2, sick=(), arms=("openarm",)),
     "flood": Row(Fault.FLOOD, once("babble", 0x55), 16, sick=()),
@@ -190,6 +197,24 @@ def test_what_is_only_a_warning_moves_on(enabled: dict[str, Rig], name: str, val
     assert rig.driver.report()["found"][fault] > 0
 
 
+@pytest.mark.parametrize("speed", [0.0, SPEED], ids=["at rest", "at speed"])
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_drive_that_needs_rest_slows_the_arm_until_it_has_cooled(
+    enabled: dict[str, Rig], arm: str, speed: float
+) -> None:
+    """Seen in two cycles by its figure or its warning, and no stop; 5 K of hysteresis where there is a figure."""
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, speed)
+    tells_figure = arm == "openarm"
+    for celsius, asks in ((84.0, False), (85.0, True), (81.0, tells_figure), (79.0, False), (84.0, False)):
+        rig.strike("hot", SICK + 1, celsius)
+        for _ in range(2):
+            sample = step(rig, wanted(), speed)
+        assert sample is not None and RobotFlag.READY in sample.flags
+        assert (RobotFlag.WARM in sample.flags) is asks, f"at {celsius:g} C"
+    assert rig.driver.report()["found"][Fault.HEATED] > 0 and rig.driver.fault is None
+
+
 def test_nothing_is_enabled_or_reset_by_itself(enabled: dict[str, Rig]) -> None:
     rig = copy.deepcopy(enabled["openarm"])
     run_up(rig, 0.0)
@@ -199,6 +224,52 @@ def test_nothing_is_enabled_or_reset_by_itself(enabled: dict[str, Rig]) -> None:
     rig.driver.read(rig.now_ns())
     rig.driver.stop()
     assert not special and rig.driver._stream.powers()[SICK] is Power.DISABLED
+
+
+@pytest.mark.parametrize("speed", [0.0, SPEED], ids=["at rest", "at speed"])
+@pytest.mark.parametrize("jammed", ["brake", "contact"])
+def test_an_axis_whose_brake_does_not_tell_that_it_has_closed_keeps_its_power(
+    enabled: dict[str, Rig], jammed: str, speed: float
+) -> None:
+    """Told once the arm is at rest; the others are braked and switched off, and nothing gives way."""
+    rig = copy.deepcopy(enabled["panda"])
+    run_up(rig, speed)
+    rig.strike(jammed, SICK + 1, 0.0)
+    rig.driver.stop()
+    rest, drives = rig.line.mechanics.q.copy(), rig.line.drives
+    rig.run(1_000_000_000)
+    np.testing.assert_allclose(rig.line.mechanics.q, rest, atol=1e-3)
+    assert [drive.is_enabled for drive in drives] == [i == SICK for i in range(7)]
+    assert all(drive.brake_closed for i, drive in enumerate(drives) if i != SICK)
+    (found,) = rig.driver._stream.found
+    assert (found.fault, found.axis) == (Fault.BRAKE, SICK) and "support the arm" in rig.driver.fault.hint
+
+
+def test_brakes_are_closed_before_the_power_goes(enabled: dict[str, Rig]) -> None:
+    rig = copy.deepcopy(enabled["panda"])
+    run_up(rig, SPEED)
+    tick, unbraked = rig.line.tick, []
+    rig.line.tick = lambda t_ns: (
+        tick(t_ns), unbraked.extend(d.node for d in rig.line.drives if not d.is_enabled and not d._contact)
+    )[0]  # fmt: skip
+    rig.driver.stop()
+    assert not unbraked and rig.driver.fault is None
+    assert not any(drive.is_enabled for drive in rig.line.drives)
+
+
+def test_without_contacts_the_drives_close_their_brakes_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    without = dataclasses.replace(arms.ARMS["panda"], brake_contact=None)  # type: ignore[type-var]
+    monkeypatch.setitem(arms.ARMS, "panda", without)
+    rig = Rig("panda")
+    asked: list[int] = []
+    rig.driver.configure()
+    rig.line.listeners.append(
+        lambda d: asked.append(d.frame.id) if d.frame.data[1:3] in (b"\xfd\x60", b"\xfe\x60") else None
+    )
+    rig.driver.activate(rig.period_ns)
+    rig.driver.stop()
+    assert rig.driver.fault is None and not asked
+    assert all(drive.brake_closed and not drive.is_enabled for drive in rig.line.drives)
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -212,6 +283,40 @@ def test_a_velocity_is_followed(enabled: dict[str, Rig], arm: str) -> None:
         sample = rig.cycle(JointCommand(0, CommandKind.VELOCITY, vector(q), vector(dq), tau, False))
         assert sample is not None and RobotFlag.READY in sample.flags
     np.testing.assert_allclose(rig.line.mechanics.dq, 0.3, atol=0.03)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_axis_that_is_held_is_seen_when_a_velocity_is_commanded(enabled: dict[str, Rig], arm: str) -> None:
+    rig = copy.deepcopy(enabled[arm])
+    run_up(rig, 0.0)
+    q, dq = rig.driver.read(rig.now_ns()).q, vector(np.full(7, SPEED))
+    command = JointCommand(0, CommandKind.VELOCITY, q, dq, rig.driver.dynamics(q, dq, np.zeros(7)), False)
+    for _ in range(60):
+        sample = rig.cycle(command)
+        assert sample is not None and RobotFlag.READY in sample.flags
+    rig.strike("block", SICK + 1)
+    struck = rig.driver._stream.seq
+    while not rig.driver._stream.found:
+        rig.cycle(command)
+        assert rig.driver._stream.seq < struck + 80
+    assert {(found.fault, found.axis) for found in rig.driver._stream.found} == {(Fault.FOLLOWING, SICK)}
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_axis_where_no_axis_can_be_is_not_believed(enabled: dict[str, Rig], arm: str) -> None:
+    """The zero of the encoder goes away, in steps that are neither a jump nor a slip, and the target goes with it."""
+    rig = copy.deepcopy(enabled[arm])
+    wanted, joint = run_up(rig, 0.0), rig.driver._codec.joints[3]
+    rig.strike("block", 4)
+    step_by, edge = (-0.004, joint.q_min - 0.1) if arm == "openarm" else (0.015, joint.q_max + 0.1)
+    while not rig.driver._stream.found:
+        rig.strike("encoder", 4, step_by)
+        told = rig.driver.read(rig.now_ns()).q
+        assert (told[3] - edge) * np.sign(step_by) < 0.05
+        step(rig, vector(np.where(np.arange(7) == 3, told, wanted())), 0.0)
+    (found,) = rig.driver._stream.found
+    assert found.fault is Fault.ENCODER and found.axis == 3 and "outside its range" in found.detail
+    assert (rig.driver._stream.axes[3].feedback.q - edge) * np.sign(step_by) > 0.0
 
 
 @pytest.mark.parametrize("arm", ARMS)

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import struct
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from can_rig import Rig
 
+from asc_rt import control
+from asc_rt.config import load_cell
+from asc_rt.core.system import System
 from drivers.base import HandshakeError, LinkError
-from drivers.can import arms, start_up
+from drivers.can import arms, cia402_arm, start_up
+from drivers.can.cia402_arm import Cia402Arm
 from drivers.can.driver import Can
 from sim_hil.can import cia402_drive
 from sim_hil.can.line import FIRST_DRIVE
@@ -68,6 +74,8 @@ BEFORE: dict[str, tuple[str, str, Callable[[Rig], Any]]] = {  # arm, line, what 
     "no torque mode": ("panda", "axis 4 modes", lambda rig: drive(rig)._od.update({(0x6502, 0): 0x180})),
     "velocity range": ("openarm", "axis 4 scale", lambda rig: setattr(drive(rig).settings, "velocity", 10.001)),
     "gear": ("panda", "axis 4 scale", lambda rig: drive(rig)._od.update({(0x6091, 1): 101})),
+    "least position": ("panda", "axis 4 limits", lambda rig: drive(rig)._od.update({(0x607D, 1): -6_408_171})),
+    "greatest position": ("panda", "axis 4 limits", lambda rig: drive(rig)._od.update({(0x607D, 2): -145_600})),
     "rated torque": ("panda", "axis 4 scale", lambda rig: drive(rig)._od.update({(0x6076, 0): 86_999})),
     "destroyed frames": ("openarm", "bus state", lambda rig: setattr(rig.line.bus, "corrupt", Corrupt())),
 }
@@ -98,6 +106,8 @@ AFTER: dict[str, tuple[str, str, Callable[[Rig], Any]]] = {  # what goes wrong o
     "refuses its time-out": ("panda", "axis 4 watchdog", refuses_its_timeout),
     "ignores to be enabled": ("openarm", "enable axis 4", lambda rig: ignores(rig, "_special")),
     "is never ready": ("panda", "enable axis 4", never_enables),
+    "a brake that stays closed": ("panda", "brake of axis 4", lambda rig: rig.strike("brake", SICK + 1, 1.0)),
+    "a contact that tells closed": ("panda", "brake of axis 4", lambda rig: rig.strike("contact", SICK + 1, 1.0)),
     "gives way": ("openarm", "hold", lambda rig: rig.line.mechanics.load.__setitem__(0, 12.0)),
 }
 
@@ -131,7 +141,7 @@ def test_what_goes_wrong_with_the_arm_refuses_the_start(wrong: str) -> None:
     with pytest.raises(HandshakeError, match=f"start-up refused: {line}: ") as refused:
         rig.driver.activate(rig.period_ns)
     assert refused.value.hint
-    if not line.startswith(("enable", "hold")):
+    if not line.startswith(("enable", "brake", "hold")):
         assert not any(d.is_enabled for d in rig.line.drives), "nothing is enabled before all is known to be well"
 
 
@@ -154,6 +164,37 @@ def test_without_anything_wrong_it_starts(arm: str) -> None:
         "home",
     } < lines
     assert {"identity", "firmware", "scale", "watchdog", "hold"} < lines
+
+
+@pytest.mark.parametrize(("sign", "zero"), [(1, 0), (-1, 0), (1, 5000), (-1, -5000)])
+def test_the_limits_of_a_drive_are_those_of_its_joint_to_the_count(sign: int, zero: int) -> None:
+    """By hand: 131072 counts a turn of the motor, a hundred turns; a drive that turns the other way swaps the two."""
+    counts = sorted(sign * round(deg / 360 * 131072 * 100) + zero for deg in (-176.001, -3.999))
+    arm = cast(Cia402Arm, arms.ARMS["panda"])
+    scale = dataclasses.replace(arm.scales[3], sign=sign, zero=zero)
+    for low, high, ok in ((0, 0, True), (1, 0, False), (0, -1, False), (-1, 0, False), (0, 1, False)):
+        told = {1: SimpleNamespace(raw=counts[0] + low), 2: SimpleNamespace(raw=counts[1] + high)}
+        line = cia402_arm._limits("axis 4", cast(Any, {0x607D: told}), scale, arm.joints[3])
+        assert line.ok is ok and str(counts[0] + low) in line.detail
+        assert f"607Dh:01 = {counts[0]} and 607Dh:02 = {counts[1]}" in line.fix
+
+
+@pytest.mark.parametrize("name", ["openarm-sim", "panda-torque-sim"])
+def test_a_cell_that_goes_farther_than_the_drives_is_refused_with_the_figure(name: str) -> None:
+    cell = load_cell(name)
+    rig = rig_of(cell.driver["arm"])
+    caps = rig.driver.configure()
+    rig.driver.close()
+    control._check(caps, System(cell.params))
+    for low, high in ((-0.001, 0.0), (0.0, 0.001)):
+        robot = cell.params.robot
+        q_min, q_max = list(robot.q_min), list(robot.q_max)
+        q_min[SICK], q_max[SICK] = q_min[SICK] + low, q_max[SICK] + high
+        wide = dataclasses.replace(robot, q_min=tuple(q_min), q_max=tuple(q_max))
+        with pytest.raises(HandshakeError, match="goes farther .*: joint 4: .* in the cell, .* in the") as refused:
+            control._check(caps, System(dataclasses.replace(cell.params, robot=wide)))
+        assert f"{math.degrees(q_min[SICK]):.4f} to {math.degrees(q_max[SICK]):.4f} deg" in str(refused.value)
+        assert "position_deg" in refused.value.hint and "joint 3" not in str(refused.value)
 
 
 def test_a_setting_that_a_drive_does_not_take_refuses_the_start(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from sim_hil.can.arms import ARMS
 from sim_hil.can.bus import Bus, Delivery
+from sim_hil.can.cia402_drive import ENABLED, POSITION, Cia402Drive, Data
 from sim_hil.can.frames import ERROR_ACK, ERROR_BUS_OFF, NUMBER, Frame, pack, unpack
 from sim_hil.can.line import Line
 from sim_hil.can.mechanics import Joints
@@ -152,3 +153,12 @@ def test_a_drive_follows_a_set_point_and_holds_when_nobody_talks_to_it() -> None
     assert not line.drives[0].is_enabled
     assert line.mechanics.q[0] == pytest.approx(0.5, abs=5e-3) and abs(line.mechanics.dq[0]) < 1e-3
     client.shutdown()
+
+
+@pytest.mark.parametrize(("target_deg", "held_deg"), [(20.0, 10.0), (-20.0, -10.0), (5.0, 5.0)])
+def test_a_drive_goes_no_farther_than_its_position_limits(target_deg: float, held_deg: float) -> None:
+    drive = Cia402Drive(1, Data(rated=87.0, kp=100.0, kd=0.0, limits_deg=(-10.0, 10.0)))
+    drive.state = ENABLED
+    drive._od[0x6060, 0], drive._od[0x607A, 0] = POSITION, round(target_deg / 360 * 131072 * 100)
+    torque = drive.tick(0.0, 0.0, 1_000_000)
+    assert torque == pytest.approx(100.0 * np.radians(held_deg), abs=1e-3)
