@@ -30,14 +30,14 @@ from sim_hil.person import Array, Capsules
 from sim_hil.roamer import Roamer
 
 PERIOD = 1 / 15  # s between captures
-SECONDS = 5.0  # of an episode
+SECONDS, EMPTY_SECONDS = 5.0, 60.0  # of an episode with a person; without
 START = 2.0  # s of each person's script, in which they only come nearer, are left out
 LEAST_TRUE = 0.1  # m: nearer, the shell around the robot is blind
 HORIZON = 0.1  # s: what control makes of a message so much later
 NEAR = 1.0  # m: where distances matter (the cells' activation distance)
 EYES = ((0.3, 2.4, 2.6), (1.9, -1.6, 2.6))  # m: neither opposite nor beside each other, so that shadows seldom meet
 TARGET = (0.15, 0.0, -0.1)
-VOLUME = ((-1.4, -1.5, -0.45), (1.8, 1.5, 1.15))  # m
+VOLUME = ((-1.45, -1.9, -0.45), (1.9, 1.9, 1.15))  # m: 1.2 m around all that `arm_at` does
 VOXEL = 0.05  # m
 RODS = (0.03, 0.04, 0.055, 0.07, 0.1, 0.16)  # m wide
 RANGES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5)  # m from the camera
@@ -132,14 +132,14 @@ def _distance(s: Studio, q: Array, seen: Seen, horizon: float) -> float:
     return s.judge.distance().distance
 
 
-def table(looks: list[Look], empty: list[Look]) -> dict[str, Any]:
-    """What the campaign found."""
+def table(looks: list[Look], empty: list[list[Look]]) -> dict[str, Any]:
+    """What the campaign found. `empty`: episodes in which nobody was there."""
     true, told, bound = (np.array([getattr(x, name) for x in looks]) for name in ("true", "told", "bound"))
     counts = (true > LEAST_TRUE) & (true < NEAR)
     over = told[counts] - true[counts]
     later = np.array([[x.true_later, x.told_later] for x in looks])
     soon = (later[:, 0] > LEAST_TRUE) & (later[:, 0] < NEAR)
-    hours = len(empty) * PERIOD / 3600
+    hours = sum(map(len, empty)) * PERIOD / 3600
     return {
         "captures": len(looks),
         "judged": int(counts.sum()),
@@ -151,15 +151,17 @@ def table(looks: list[Look], empty: list[Look]) -> dict[str, Any]:
         "over_later": int((later[soon, 1] > later[soon, 0]).sum()),
         "worst_over_later_m": round(float((later[soon, 1] - later[soon, 0]).max()), 4),
         "empty_hours": round(hours, 3),
-        "false_stops_per_hour": round(_stops(empty) / hours, 2) if empty else None,
+        "false_stops": sum(map(_stops, empty)),
+        "starts_refused": sum(episode[0].told < NEAR for episode in empty),
         "cpu_ms_median": round(float(np.median([x.cpu for x in looks])) * 1e3, 2),
     }
 
 
 def _stops(empty: list[Look]) -> int:
-    """How often, nobody being there, something seems near: each time it begins."""
+    """How often, nobody being there, something seems near: each time it begins. An episode that begins so is no stop
+    but a start refused: the arm stands, and may not be armed before it has shown what it hides."""
     near = [look.told < NEAR for look in empty]
-    return sum(now and not before for before, now in zip([False, *near], near, strict=False))
+    return sum(now and not before for before, now in zip(near, near[1:], strict=False))
 
 
 def rods(tries: int = 10) -> dict[str, dict[str, float]]:
@@ -217,13 +219,14 @@ def main(argv: list[str]) -> int:
         result = seeing_campaign.run(seeds, options.seconds, options.workers)
         print(json.dumps(result))
         return 0 if not result["robot_caused"] else 1
-    jobs = [(seed, SECONDS, True) for seed in seeds] + [(seed, SECONDS, False) for seed in seeds[: options.n // 8 + 1]]
+    jobs = [(seed, SECONDS, True) for seed in seeds]
+    jobs += [(seed, EMPTY_SECONDS, False) for seed in seeds[: options.n // 8 + 1]]
     with ProcessPoolExecutor(options.workers) as pool:
         done = list(tqdm(pool.map(episode, *zip(*jobs, strict=True)), total=len(jobs), disable=None))
     looks = [look for found in done[: options.n] for look in found]
-    result = table(looks, [look for found in done[options.n :] for look in found])
+    result = table(looks, done[options.n :])
     print(json.dumps(result))
-    return 0 if not result["over_bound"] else 1
+    return 1 if result["over_bound"] or result["over_later"] or result["false_stops"] else 0
 
 
 if __name__ == "__main__":
