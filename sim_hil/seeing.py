@@ -39,8 +39,7 @@ EYES = ((0.3, 2.4, 2.6), (1.9, -1.6, 2.6))  # m: neither opposite nor beside eac
 TARGET = (0.15, 0.0, -0.1)
 VOLUME = ((-1.45, -1.9, -0.45), (1.9, 1.9, 1.15))  # m: 1.2 m around all that `arm_at` does
 VOXEL = 0.05  # m
-RODS = (0.03, 0.04, 0.055, 0.07, 0.1, 0.16)  # m wide
-RANGES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5)  # m from the camera
+RODS = 10  # of each width at each distance
 
 
 @dataclass
@@ -164,42 +163,6 @@ def _stops(empty: list[Look]) -> int:
     return sum(now and not before for before, now in zip(near, near[1:], strict=False))
 
 
-def rods(tries: int = 10) -> dict[str, dict[str, float]]:
-    """Share of upright rods, 1 m long, that are seen: by width (mm) and distance (m) from one camera of 640x480."""
-    optics = Optics(640, 480, 525.0, 525.0)
-    params = load_cell("fanuc-sim").params
-    scene, system = Scene(params), System(params)
-    pose = look_at((2.4, 0.0, 0.4), (0.0, 0.0, 0.2))
-    eye = Eye(scene, pose, optics, 1)
-    grid = Grid.over(np.array([-1.4, -0.6, -0.3]), np.array([1.5, 0.6, 1.0]), VOXEL)
-    view = View(lens_of(optics), UNIT, pose, eye.empty(), grid)
-    rng, found = np.random.default_rng(1), {}
-    for width in RODS:
-        found[f"{width * 1e3:.0f}"] = {
-            f"{far:g}": float(
-                np.mean([_sees_rod(scene, system, eye, view, grid, width, far, rng) for _ in range(tries)])
-            )
-            for far in RANGES
-        }
-    return found
-
-
-def _sees_rod(
-    scene: Scene, system: System, eye: Eye, view: View, grid: Grid, width: float, far: float, rng: np.random.Generator
-) -> bool:
-    observer, q = Observer(system.model, grid, [view], [0.0]), np.radians([90, -40, 0, 0, 0, 0])
-    scene.pose(q)
-    for k in range(12):  # an empty cell first
-        scene.set_person(_NOBODY)
-        observer.observe(round(k * PERIOD * 1e9), [eye.sense()], q)
-    x, y = 2.4 - far, 0.35 + rng.uniform(-0.05, 0.05)
-    scene.rods([(np.array([x, y, -0.2]), np.array([x, y, 0.8]), width / 2)])
-    seen = observer.observe(round(12 * PERIOD * 1e9), [eye.sense()], q)
-    parts = seen.parts
-    near = np.hypot(parts.p0[:, 0] - x, parts.p0[:, 1] - y) < 0.2 + parts.radius
-    return bool(near.any())
-
-
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim_hil seeing", description="Perception judged by the truth.")
     parser.add_argument("-n", type=int, default=200, help="episodes with a person; an eighth more without")
@@ -210,7 +173,9 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--rods", action="store_true", help="the detection of rods instead")
     options = parser.parse_args(argv)
     if options.rods:
-        print(json.dumps(rods()))
+        from sim_hil import seeing_rods
+
+        print(json.dumps(seeing_rods.table(RODS, options.workers)))
         return 0
     seeds = [options.seed * 100_000 + i for i in range(options.n)]
     if options.cell:

@@ -16,7 +16,7 @@ from asc_rt.perception.parts import PARTS, Tracker, capsule
 from asc_rt.perception.volume import LEAST_INTRUSION, REACH_SPEED, Volume
 from calibration.geometry import look_at
 from drivers.cameras.base import Intrinsics
-from sim_hil import seeing
+from sim_hil import seeing, seeing_rods
 
 NOWHERE = np.zeros((1, 3)), np.zeros((1, 3)), np.array([-9.0])  # an arm that is not there
 STEP_NS = 66_000_000
@@ -208,6 +208,18 @@ def test_a_start_that_is_refused_is_no_stop_and_what_comes_later_is_one() -> Non
     looks = [seeing.Look(0.5, 0.4, 0.5, 0.3, 0.04, 0.0)]
     result = seeing.table(looks, [told(0.2, 0.3, 9.0, 9.0), told(9.0, 0.9, 0.9, 9.0, 0.1), told(9.0, 1.1)])
     assert (result["starts_refused"], result["false_stops"]) == (1, 2)
+
+
+@pytest.mark.parametrize("width", [0.03, 0.07])
+@pytest.mark.parametrize("far", [1.0, 3.5])
+def test_a_rod_is_seen_at_once(width: float, far: float) -> None:
+    """The short version of `python -m sim_hil seeing --rods`."""
+    assert seeing_rods.seen("160x120", width, far, 2) == 1.0
+
+
+def test_a_wire_is_not_seen() -> None:
+    """So the table can fail."""
+    assert seeing_rods.seen("160x120", 0.002, 3.5, 4) < 0.5
 
 
 # --- does the camera stand where it stood ----------------------------------------------------------------------------
