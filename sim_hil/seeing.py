@@ -170,6 +170,9 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--cell", action="store_true", help="the whole cell that sees, in lockstep, instead")
     parser.add_argument("--seconds", type=float, default=10.0, help="with --cell: of an episode")
+    parser.add_argument(
+        "--faults", action="store_true", help="what the running cell does when its cameras fail, instead"
+    )
     parser.add_argument("--rods", action="store_true", help="the detection of rods instead")
     options = parser.parse_args(argv)
     if options.rods:
@@ -177,6 +180,12 @@ def main(argv: list[str]) -> int:
 
         print(json.dumps(seeing_rods.table(RODS, options.workers)))
         return 0
+    if options.faults:
+        from sim_hil import seeing_faults
+
+        rows = seeing_faults.table("fanuc-sim-seeing")
+        print(json.dumps(rows))
+        return 0 if len(rows) == sum(map(len, seeing_faults.SESSIONS)) and all(map(seeing_faults.is_safe, rows)) else 1
     seeds = [options.seed * 100_000 + i for i in range(options.n)]
     if options.cell:
         from sim_hil import seeing_campaign
