@@ -34,6 +34,7 @@ JOINTS = Topic(
 CONTROL = Topic("cell/control", "json", 0, Delivery.QUEUE, "start, end and errors of the control process")
 CLOCK = Topic("cell/clock", "json", 1, Delivery.ASKED, '{"id": str, "t_ns": int}: this machine\'s monotonic clock')
 FAULT = Topic("sim/fault", "json", 0, Delivery.QUEUE, "a fault of the simulated robot, as in its script, now")
+CAMERA_FAULT = Topic("sim/camera_fault", "json", 0, Delivery.QUEUE, "a fault of the simulated cameras, likewise")
 CAMERA = Topic("cell/camera", "foxglove.CompressedImage", 15, Delivery.QUEUE, "what cameras see; frame_id: which")
 CAMERA_CALIBRATION = Topic(
     "cell/camera_calibration", "foxglove.CameraCalibration", 1, Delivery.QUEUE, "their lenses; frame_id: which camera"
@@ -46,6 +47,7 @@ PERCEPTION = "perception"  # says so, too
 
 TOPICS = (
     HUMAN, OPERATOR, GOAL, STATE, JOINTS, CONTROL, CLOCK, CAMERA, CAMERA_CALIBRATION, PERSON_TRUTH, PLANT_TRUTH, FAULT,
+    CAMERA_FAULT,
 )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,8 @@ def serve(cell: Cell, settings: Settings, bus: Bus, script: Sequence[Fault], sto
     servers = {
         m.name: StreamServer(m.host, m.port, settings.optics, m.serial, period_ns, latency_ns) for m in settings.mounts
     }
-    ready = bus.publisher(topics.ready("camera").key)
+    ready, wrongs = bus.publisher(topics.ready("camera").key), bus.queue(topics.CAMERA_FAULT.key)
+    script = list(script)
     try:
         for server in servers.values():
             server.open()
@@ -169,7 +170,9 @@ def serve(cell: Cell, settings: Settings, bus: Bus, script: Sequence[Fault], sto
                 time.sleep(max(min(frame.due_ns, said.due_ns) - time.monotonic_ns(), 0) * 1e-9)
                 continue
             stage.set(now_ns)
-            for name, wrong, moved in struck(script, list(eyes), (now_ns - began) * 1e-9):
+            t = (now_ns - began) * 1e-9
+            script += [replace(f, at_s=t) for f in fault_script.heard(wrongs.take, Fault, topics.CAMERA_FAULT.key)]
+            for name, wrong, moved in struck(script, list(eyes), t):
                 servers[name].faults = wrong
                 eyes[name].move(moved)
             pictures = {name: eye.sense() for name, eye in eyes.items()}

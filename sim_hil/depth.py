@@ -143,12 +143,15 @@ class Eye:
         return np.where(ids >= 0, distance / self._length[pixels], 0.0)
 
     def _near_something(self) -> npt.NDArray[np.bool_]:
-        """Pixels whose ray passes the bounding sphere of anything that moves: the others see the empty room."""
+        """Pixels whose ray passes the bounding sphere of anything that moves: the others see the empty room.
+
+        A ray meets a sphere in direction `to` with radius r where it goes at least sqrt(to^2 - r^2) along `to`.
+        """
         centres, radii = self._scene.spheres()
         to = centres - self._T[:3, 3]
-        along = self._directions @ to.T  # (pixels, spheres) m
-        apart = np.einsum("ij,ij->i", to, to) - along**2
-        return np.any((apart < radii**2) & (along > -radii), axis=1)
+        tangent = np.einsum("ij,ij->i", to, to) - radii**2  # negative: the camera is in the sphere
+        least = np.where(tangent > 0, np.sqrt(np.maximum(tangent, 0.0)), -np.inf)
+        return np.any(self._directions @ to.T >= least, axis=1)
 
     def _in_shadow(self, z: Array) -> npt.NDArray[np.bool_]:
         """The projector stands right of the lens: what something nearer, farther right, hides from it."""

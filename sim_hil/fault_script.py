@@ -52,10 +52,10 @@ def read(path: Path, kind: type[Fault]) -> list[Fault]:
     return parse(table["faults"], str(path), kind)
 
 
-def heard(take: Callable[[], bytes | None], kind: type[Fault]) -> Iterator[Fault]:
+def heard(take: Callable[[], bytes | None], kind: type[Fault], key: str = "sim/fault") -> Iterator[Fault]:
     """What came over the bus since it was asked last, to happen now; what is no fault is told on stderr."""
     while (data := take()) is not None:
         try:
-            yield from parse(json.loads(data), "sim/fault", kind)
+            yield from parse(json.loads(data), key, kind)
         except ValueError as error:
             print(error, file=sys.stderr, flush=True)

@@ -27,7 +27,7 @@ from asc_rt.perception.cameras import grid_of, pose_bound
 from asc_rt.perception.eye import CameraInfo, DepthFrame, Eye
 from asc_rt.perception.grid import View
 from asc_rt.perception.observer import Observer
-from asc_rt.perception.sensor import Identity, Sensor
+from asc_rt.perception.sensor import Identity, Sensor, around
 from asc_rt.perception.stance import Stance
 from sim_hil import depth
 from sim_hil.camera import true_pose
@@ -155,7 +155,8 @@ class Studio:
         eyes = [Eye(c.name, info, v, 0, s) for c, v, s in zip(options.cameras, views, stances, strict=True)]
         bounds = [pose_bound(camera.pose, grid) for camera in options.cameras]
         observer = Observer(system.model, grid, views, bounds, options.margin)
-        identity = Identity(number, options.digest, options.margin, options.detection)
+        least = around(system.params.safety.activation_distance)
+        identity = Identity(number, options.digest, options.margin, options.detection, least)
         return Sensor(identity, eyes, observer, clock_id, lambda t_ns: (t_ns, 0))
 
     def look(self, t: float, now_ns: int, q: Array, person: Capsules) -> None:

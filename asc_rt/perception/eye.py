@@ -7,7 +7,7 @@ from asc_rt.perception.stance import LIMIT, Stance
 from drivers.cameras.base import CameraInfo, Depth, DepthFrame
 from drivers.cameras.watch import CameraFault, Watch, moved
 
-__all__ = ["CameraInfo", "DepthFrame", "Eye"]
+__all__ = ["CameraFault", "CameraInfo", "DepthFrame", "Eye"]
 
 GOOD_AGAIN = 15  # frames in order, one after another, until a camera that was wrong is believed
 

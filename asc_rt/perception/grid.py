@@ -39,6 +39,12 @@ class Grid(NamedTuple):
         """m, from the centre of a voxel to its corner."""
         return float(np.sqrt(0.75) * self.size)
 
+    def around(self, p0: np.ndarray, p1: np.ndarray, radius: np.ndarray) -> float:
+        """m, from these capsules to the nearest of the four sides, where people come in; negative: they stick out."""
+        low, high = self.origin[:2], self.origin[:2] + self.size * np.array(self.shape[:2])
+        ends, r = np.vstack([p0, p1])[:, :2], np.tile(radius, 2)[:, None]
+        return float(min((ends - low - r).min(), (high - ends - r).min()))
+
     def corners(self) -> np.ndarray:
         """(8, 3) m, of the whole."""
         return np.asarray(self.origin + self.size * np.array(list(np.ndindex(2, 2, 2))) * self.shape)

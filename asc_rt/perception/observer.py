@@ -22,6 +22,7 @@ class Seen:
     t_ns: int
     parts: Parts
     position_bound: float  # m: how far a surface may lie outside its capsule
+    around: float  # m: nobody outside the guarded volume is nearer to the arm
 
 
 class Observer:
@@ -48,4 +49,5 @@ class Observer:
         grown = self._model.capsules.radius + self._margin
         points = self.volume.update(t_ns, depths, (p0, p1, grown))
         distance = kernels.distances(points, p0, p1, self._model.capsules.radius)
-        return Seen(t_ns, self._tracker.update(t_ns, points, distance), self._bound)
+        around = self.volume.grid.around(p0, p1, self._model.capsules.radius)
+        return Seen(t_ns, self._tracker.update(t_ns, points, distance), self._bound, around)

@@ -26,7 +26,7 @@ from asc_rt.core.system import System
 from asc_rt.human_codec import clock_id
 from asc_rt.perception.background import BackgroundError
 from asc_rt.perception.cameras import CameraError, Frames, Opened, Reader, observer_of, open_all
-from asc_rt.perception.sensor import Identity, Sensor
+from asc_rt.perception.sensor import Identity, Sensor, around
 from asc_rt.remote import join
 from drivers.cameras.base import DepthFrame
 
@@ -81,7 +81,8 @@ def sensor_of(cell: Cell, opened: Sequence[Opened], clock: CellClock | None = No
     assert options is not None
     observer, eyes = observer_of(options, opened, System(cell.params).model, len(cell.params.human.sensors))
     (number,) = [sensor.id for sensor in cell.params.human.sensors if sensor.name == options.sensor]
-    identity = Identity(number, options.digest, options.margin, options.detection)
+    least = around(cell.params.safety.activation_distance)
+    identity = Identity(number, options.digest, options.margin, options.detection, least)
     if clock is None:
         return Sensor(identity, eyes, observer, clock_id, lambda t_ns: (t_ns, 0))
     return Sensor(identity, eyes, observer, lambda: clock.id, clock.convert)

@@ -2,8 +2,9 @@
 
 `possible` grows by the reach of a person (K = 2 m/s, ISO 13855) from one capture to the next, from itself and from
 every place where people can come from unseen, and loses what any camera sees free. So a person who steps behind the
-robot stays there, and the shadow behind a person is occupied. Unseen pockets that are cut off from everything, where no
-camera sees a surface, and in which nobody fits, are empty.
+robot stays there, and the shadow behind a person is occupied. Without a seen surface is empty: a pocket that is
+cut off from everything and in which nobody fits; and what joins the way in, until as much as an arm stays unseen there
+for two captures.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ REACH_SPEED = 2.0  # m/s: nobody moves any part faster. ISO 13855's K for hands,
 PERSON_VOLUME = 0.040  # m3: a body takes more; in a smaller closed pocket there is none. ASSUMED: 40 kg
 LEAST_AREA = 4e-4  # m2 of seen surface that is a thing, not noise: the detection capability (55 mm rods)
 LEAST_PIXELS = 3
-LEAST_INTRUSION = 0.002  # m3, 0.3 m of an arm, at the border of the volume, without a seen surface
+LEAST_INTRUSION = 0.002  # m3, 0.3 m of an arm, where people come in, without a seen surface
 BACKGROUND_STEP = 0.025  # m before the background, at least
 
 
@@ -36,6 +37,7 @@ class Volume:
         self._sources = self._unseen_entries()
         self._steps = [_steps(view) for view in views]
         self._possible = np.ones(len(self._centres), np.uint8)
+        self._unseen = self._possible > 0  # at the last capture
         self._t_ns: int | None = None
 
     def coverage(self, sees: Sequence[bool]) -> float:
@@ -60,7 +62,8 @@ class Volume:
         return self._keep_what_may_be_a_person(seen, count)
 
     def _grow(self, t_ns: int) -> None:
-        """By the way that anybody can make since the last capture; the cylinder around that ball."""
+        """By the way that anybody can make since the last capture, also from where people come in unseen; the cylinder
+        around that ball."""
         dt = 0.0 if self._t_ns is None else max(t_ns - self._t_ns, 0) * 1e-9
         self._t_ns = t_ns
         reach = min(REACH_SPEED * dt / self.grid.size, float(max(self.grid.shape)))
@@ -68,9 +71,9 @@ class Volume:
         offset = np.maximum(np.abs(np.arange(-n, n + 1)) - 1, 0)
         disc = (np.hypot(offset[:, None], offset[None]) <= reach).astype(np.uint8)
         nx, ny, nz = self.grid.shape
-        up = cv2.dilate(self._possible.reshape(nx * ny, nz), np.ones((1, 2 * n + 1), np.uint8)).reshape(nx, ny, nz)
+        before = self._possible | self._sources
+        up = cv2.dilate(before.reshape(nx * ny, nz), np.ones((1, 2 * n + 1), np.uint8)).reshape(nx, ny, nz)
         self._possible = np.ascontiguousarray(_each_layer(up, disc)).ravel()
-        self._possible |= self._sources
 
     def _find_surfaces(
         self, view: View, step: np.ndarray, depth: Depth, arm: tuple[np.ndarray, np.ndarray, np.ndarray],
@@ -90,12 +93,15 @@ class Volume:
 
     def _keep_what_may_be_a_person(self, seen: np.ndarray, count: np.ndarray) -> np.ndarray:
         found, label = kernels.components(self._possible, self.grid.shape)
+        again = (self._unseen & self.guarded)[found]  # noise does not hide the same place twice
+        self._unseen = self._possible > 0
         if not len(found):
             return np.zeros((0, 3))
-        volume = np.bincount(label) * self.grid.size**3
+        volume, entered = (np.bincount(label, weight) * self.grid.size**3 for weight in (None, again))
         is_thing = (np.bincount(label, seen[found]) >= LEAST_AREA) & (np.bincount(label, count[found]) >= LEAST_PIXELS)
-        is_entry = (np.bincount(label, self._sources[found]) > 0) & (volume >= LEAST_INTRUSION)
-        keep = (is_thing | is_entry | (volume >= PERSON_VOLUME))[label]
+        is_entry = np.bincount(label, self._sources[found]) > 0
+        is_large = np.where(is_entry, entered >= LEAST_INTRUSION, volume >= PERSON_VOLUME)
+        keep = (is_thing | is_large)[label]
         self._possible[found[~keep]] = 0
         told = found[keep]
         return self._centres[told[self.guarded[told] | (count[told] > 0)]]

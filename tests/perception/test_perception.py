@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asc_rt.perception import kernels
-from asc_rt.perception.arm import EXTRAPOLATION_NS, JointHistory
+from asc_rt.perception.arm import EXTRAPOLATION_NS, Arm, JointHistory
 from asc_rt.perception.grid import Grid, View, without_specks
 from asc_rt.perception.parts import PARTS, Tracker, capsule
-from asc_rt.perception.volume import REACH_SPEED, Volume
+from asc_rt.perception.volume import LEAST_INTRUSION, REACH_SPEED, Volume
 from calibration.geometry import look_at
 from drivers.cameras.base import Intrinsics
-from sim_hil import seeing
+from sim_hil import seeing, seeing_rods
 
 NOWHERE = np.zeros((1, 3)), np.zeros((1, 3)), np.array([-9.0])  # an arm that is not there
 STEP_NS = 66_000_000
@@ -22,9 +24,9 @@ LENS = Intrinsics(80, 60, 60.0, 60.0, 39.5, 29.5)
 WALL = np.full((60, 80), 4000, np.uint16)
 
 
-def one_camera() -> Volume:
+def one_camera(half_width: float = 0.6) -> Volume:
     """It looks along +x at a wall 4 m away."""
-    grid = Grid.over(np.array([1.0, -0.6, -0.4]), np.array([3.0, 0.6, 0.4]), 0.05)
+    grid = Grid.over(np.array([1.0, -half_width, -0.4]), np.array([3.0, half_width, 0.4]), 0.05)
     return Volume(grid, [View(LENS, 0.001, look_at((0, 0, 0), (1, 0, 0)), WALL, grid)])
 
 
@@ -66,6 +68,35 @@ def test_a_blind_camera_frees_nothing() -> None:
     volume = one_camera()
     assert len(volume.update(0, [None], NOWHERE)) == np.count_nonzero(volume.guarded)
     assert len(volume.update(STEP_NS, [np.zeros_like(WALL)], NOWHERE)) == np.count_nonzero(volume.guarded)
+
+
+def test_what_is_never_seen_says_nothing_new_and_who_comes_out_of_it_is_told() -> None:
+    """Left and right of the picture lies a dark wedge that people walk into unseen; beside it is watched."""
+    volume = one_camera(half_width=1.2)
+    dark = ~volume.guarded.reshape(volume.grid.shape)
+    beside = np.zeros_like(dark)
+    beside[:, 1:-1] = ~dark[:, 1:-1] & (dark[:, :-2] | dark[:, 2:])
+    at = np.flatnonzero(beside)
+    assert len(at) > LEAST_INTRUSION / volume.grid.size**3
+    assert not len(volume.update(0, [WALL], NOWHERE))
+    volume.views[0].pixel[at[:1]] = -1  # one is not seen free: noise, nobody's arm
+    assert not len(volume.update(STEP_NS, [WALL], NOWHERE))
+    pixel = volume.views[0].pixel.copy()
+    volume.views[0].pixel[at] = -1
+    assert not len(volume.update(2 * STEP_NS, [WALL], NOWHERE)), "once is noise, too"
+    assert len(volume.update(3 * STEP_NS, [WALL], NOWHERE)) == len(at)
+    volume.views[0].pixel[:] = pixel
+    assert not len(volume.update(4 * STEP_NS, [WALL], NOWHERE))
+    volume.views[0].pixel[at] = -1
+    assert not len(volume.update(5 * STEP_NS, [WALL], NOWHERE)), "from the beginning"
+
+
+def test_the_nearest_side_is_told_from_the_whole_arm() -> None:
+    grid = Grid.over(np.array([-1.0, -2.0, 0.0]), np.array([3.0, 2.0, 1.0]), 0.1)
+    p0, p1, radius = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, 9], [0, 1.5, 0]]), np.array([0.1, 0.2])
+    assert grid.around(p0, p1, radius) == pytest.approx(0.3)
+    assert grid.around(p0[:1], p1[:1], radius[:1]) == pytest.approx(0.9), "nobody comes in from above"
+    assert grid.around(p0 + [0, 1, 0], p1 + [0, 1, 0], radius) == pytest.approx(-0.7)
 
 
 def test_a_lone_missing_pixel_is_filled_with_the_nearest_and_two_are_not() -> None:
@@ -153,9 +184,42 @@ def test_no_distance_is_overestimated_and_an_empty_cell_is_empty() -> None:
     assert result["median_under_m"] < 0.2
 
 
+def test_who_comes_in_is_told_before_they_are_near() -> None:
+    """A seed whose person is still outside when the episode begins, 1.01 m from the arm, and 0.9 m 0.1 s later."""
+    s = seeing.studio()
+    for seed in (100_065, 100_073):
+        for look in seeing.episode(seed, 0.2):
+            assert look.told_later <= look.true_later
+    least = seeing.NEAR + REACH_SPEED * seeing.HORIZON
+    arm, radius = Arm(s.system.model), s.system.model.capsules.radius
+    poses = [seeing.arm_at(seed, 2.0 * leg) for seed in range(40) for leg in range(4)]
+    assert min(s.grid.around(*arm.capsules(q), radius) for q in poses) > least
+
+
 def test_the_robot_at_work_is_nobody() -> None:
     looks = seeing.episode(5, 2.0, people=False)
     assert sum(look.told < seeing.NEAR for look in looks) == 0
+
+
+def test_a_start_that_is_refused_is_no_stop_and_what_comes_later_is_one() -> None:
+    def told(*distances: float) -> list[seeing.Look]:
+        return [seeing.Look(math.inf, d, math.inf, d, 0.04, 0.0) for d in distances]
+
+    looks = [seeing.Look(0.5, 0.4, 0.5, 0.3, 0.04, 0.0)]
+    result = seeing.table(looks, [told(0.2, 0.3, 9.0, 9.0), told(9.0, 0.9, 0.9, 9.0, 0.1), told(9.0, 1.1)])
+    assert (result["starts_refused"], result["false_stops"]) == (1, 2)
+
+
+@pytest.mark.parametrize("width", [0.03, 0.07])
+@pytest.mark.parametrize("far", [1.0, 3.5])
+def test_a_rod_is_seen_at_once(width: float, far: float) -> None:
+    """The short version of `python -m sim_hil seeing --rods`."""
+    assert seeing_rods.seen("160x120", width, far, 2) == 1.0
+
+
+def test_a_wire_is_not_seen() -> None:
+    """So the table can fail."""
+    assert seeing_rods.seen("160x120", 0.002, 3.5, 4) < 0.5
 
 
 # --- does the camera stand where it stood ----------------------------------------------------------------------------

@@ -16,13 +16,14 @@ from asc_rt.config import load_cell
 from asc_rt.core.system import System
 from asc_rt.human_codec import decode
 from asc_rt.perception import background
+from asc_rt.perception.arm import Arm
 from asc_rt.perception.background import Background, BackgroundError, belongs_to
-from asc_rt.perception.cameras import mismatches, with_lens
+from asc_rt.perception.cameras import grid_of, mismatches, with_lens
 from asc_rt.perception.eye import GOOD_AGAIN, Eye
 from asc_rt.perception.grid import Grid, View, rays_of
 from asc_rt.perception.observer import Observer
 from asc_rt.perception.process import hear
-from asc_rt.perception.sensor import NO_JOINTS, Identity, Sensor
+from asc_rt.perception.sensor import ENTRY_S, NO_JOINTS, UNWATCHED, Identity, Sensor, around
 from calibration.geometry import look_at
 from calibration.result import Result, pose_value, rows
 from drivers.cameras.base import CameraInfo, DepthFrame, Intrinsics, frozen
@@ -46,7 +47,8 @@ def system() -> System:
 class Rig:
     """Two cameras 3 m from a volume behind the arm that look at a wall; `shoot` is one period of both."""
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, around: float = -9.0) -> None:
+        """`around`: the arm stands outside this volume, and may."""
         grid = Grid.over(np.array([-2.6, -0.6, -0.4]), np.array([-1.4, 0.6, 0.4]), 0.05)
         poses = [look_at((0.5, y, 0), (-1, y, 0)) for y in (-0.8, 0.8)]
         views = [View(LENS, 0.001, pose, WALL, grid) for pose in poses]
@@ -54,7 +56,7 @@ class Rig:
         observer = Observer(system.model, grid, views, [0.004, 0.009])
         self.offset: tuple[int, int] | None = (0, 0)
         self.sensor = Sensor(
-            Identity(3, CALIBRATION, 0.06, 0.07), self.eyes, observer, lambda: "C",
+            Identity(3, CALIBRATION, 0.06, 0.07, around), self.eyes, observer, lambda: "C",
             lambda t_ns: self.offset and (t_ns + self.offset[0], self.offset[1]),
         )  # fmt: skip
         self.rng, self.k, self.joints = np.random.default_rng(1), 0, True
@@ -141,6 +143,25 @@ def test_without_joints_nothing_is_told_from_the_robot(rig: Rig) -> None:
         (message,) = rig.shoot()
     assert message.health == pb.HEALTH_FAULT and message.health_bits == NO_JOINTS
     assert not message.empty_certified and not [c for body in message.bodies for c in body.capsules]
+
+
+def test_where_people_may_come_upon_the_arm_unseen_nobody_is_not_told(system: System) -> None:
+    message = Rig(system, around(1.0)).warm()
+    assert message.health == pb.HEALTH_DEGRADED and message.health_bits == UNWATCHED
+    assert not message.empty_certified
+    assert around(1.0) == pytest.approx(1.0 + 2.0 * ENTRY_S)
+
+
+@pytest.mark.parametrize("name", ["fanuc-sim-seeing"])
+def test_around_the_arm_at_its_goals_all_is_watched(name: str) -> None:
+    cell = load_cell(name)
+    assert cell.perception is not None
+    model, grid = System(cell.params).model, grid_of(cell.perception)
+    arm, least = Arm(model), around(cell.params.safety.activation_distance)
+    for a, b in zip(cell.goals, cell.goals[1:] + cell.goals[:1], strict=True):
+        for share in np.linspace(0.0, 1.0, 20):
+            q = np.array(a) + share * (np.array(b) - np.array(a))
+            assert grid.around(*arm.capsules(q), model.capsules.radius) > least + 0.05, "and room to give way"
 
 
 @pytest.mark.parametrize(
