@@ -81,18 +81,34 @@ FANUC = {
 }
 
 
-@pytest.mark.parametrize("number", FANUC)
-def test_a_fault_makes_the_step_fail(number: int, home: Path) -> None:
-    pretend(home, "fanuc-sim", [PATIENT], number)
-    faults = FANUC[number].split(" sim") if number == 8 else [FANUC[number]]
-    settings = [item if item.startswith("sim") else f"sim{item}" for item in faults]
+CAN = {
+    1: 'sim.can.faults=[{at_s = 0.0, fault = "power_cut", axis = 2}]',
+    2: "sim.can.start_deg=[0, 30, 0, 138, 0, 0, 0]",
+    3: "sim.human.latency_ms=1500",
+    4: 'sim.can.faults=[{at_s = 15.0, fault = "encoder", axis = 4, value = 0.1}]',
+    5: 'sim.can.faults=[{at_s = 8.0, fault = "block", axis = 2}]',
+    6: 'sim.can.faults=[{at_s = 4.0, fault = "hot", axis = 1, value = 90}]',
+    7: 'sim.can.faults=[{at_s = 4.0, fault = "silence", axis = 7}]',
+    8: "sim.human.start_s=1e6 sim.human.still_at_s=0.0",
+    9: 'sim.can.faults=[{at_s = 4.0, fault = "safe_torque_off"}]',
+    10: "sim.human.latency_ms=1500",
+}
+FAULTY = [("fanuc-sim", number, FANUC[number]) for number in FANUC]
+FAULTY += [("openarm-sim", number, CAN[number]) for number in CAN]
+
+
+@pytest.mark.parametrize(("cell", "number", "faults"), FAULTY)
+def test_a_fault_makes_the_step_fail(cell: str, number: int, faults: str, home: Path) -> None:
+    pretend(home, cell, [PATIENT], number)
+    settings = [item if item.startswith("sim") else f"sim{item}" for item in faults.split(" sim")]
     options = [word for item in (PATIENT, *settings) for word in ("--set", item)]
-    code, told, err = climb(home, "fanuc-sim", "--sim", "--step", str(number), *options)
+    code, told, err = climb(home, cell, "--sim", "--step", str(number), *options)
+    print(told.get("rows"))
     assert code == 1, err
     assert told["rows"][0]["verdict"] == "FAIL" and told["rows"][0]["failed"]
     assert "Traceback" not in err
     if number < 10:
-        refused, _, err = climb(home, "fanuc-sim", "--sim", "--step", str(number + 1), *options)
+        refused, _, err = climb(home, cell, "--sim", "--step", str(number + 1), *options)
         assert refused == 2 and "comes first" in err
 
 
