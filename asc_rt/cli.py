@@ -263,18 +263,38 @@ def export(
 
 
 @app.command()
+def drives(
+    cell: CellName = DEFAULT_CELL,
+    reset: Annotated[
+        list[int] | None, typer.Option(help="axis whose fault is looked after; may be repeated", metavar="AXIS")
+    ] = None,
+    supported: Annotated[
+        bool, typer.Option("--supported", help="the arm is held: an axis without brake falls when it is reset")
+    ] = False,
+    assign: Annotated[
+        int | None, typer.Option(help="node number for the one drive that has none", metavar="NODE")
+    ] = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """How each drive is; reset a fault, number a new drive. Nothing may run. Example: asc drives CELL --reset 3"""
+    from asc_rt.config import load_cell
+    from asc_rt.service import serve
+
+    if assign is not None and reset:
+        _refuse("--assign and --reset: one at a time")
+    checks = serve(load_cell(cell, overrides or []), reset or [], supported, assign)
+    if checks is None:
+        _refuse(f"{cell}: the drives of this robot are not served from here")
+    _tell_checks(checks, as_json)
+
+
+@app.command()
 def doctor(cell: CellName = DEFAULT_CELL, as_json: AsJson = False) -> None:
     """Is this PC, and this cell, fit to run? Example: asc doctor fanuc-sim"""
     from asc_rt.doctor import examine
 
-    result = examine(cell)
-    if as_json:
-        _show(result, as_json)
-    else:
-        for check in result["checks"]:
-            fix = "" if check["ok"] else f" | do: {check['fix']}"
-            print(f"{'ok  ' if check['ok'] else 'FAIL'} {check['name']}: {check['detail']}{fix}")
-    raise typer.Exit(0 if result["ok"] else 1)
+    _tell_checks(examine(cell), as_json)
 
 
 def main() -> NoReturn:
@@ -338,6 +358,16 @@ def _show(result: dict[str, Any], as_json: bool) -> None:
         return
     for key, value in result.items():
         print(f"{key:24} {_text(value)}")
+
+
+def _tell_checks(result: dict[str, Any], as_json: bool) -> NoReturn:
+    if as_json:
+        _show(result, as_json)
+    else:
+        for check in result["checks"]:
+            fix = "" if check["ok"] else f" | do: {check['fix']}"
+            print(f"{'ok  ' if check['ok'] else 'FAIL'} {check['name']}: {check['detail']}{fix}")
+    raise typer.Exit(0 if result["ok"] else 1)
 
 
 def _text(value: Any) -> str:

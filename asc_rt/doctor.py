@@ -10,7 +10,7 @@ import platform
 import resource
 import shutil
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,11 @@ def examine(cell_name: str) -> dict[str, Any]:
         findings += [Finding("cell", False, line, "correct the file") for line in error.lines]
     else:
         findings += examine_cell(cell)
+    return verdict(findings)
+
+
+def verdict(findings: Sequence[Finding]) -> dict[str, Any]:
+    """As --json tells it; what to do only where something is wrong."""
     checks = [asdict(replace(found, fix="" if found.ok else found.fix)) for found in findings]
     return {"checks": checks, "ok": all(found.ok for found in findings)}
 

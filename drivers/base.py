@@ -8,7 +8,7 @@ Recovery is policy (`asc_rt.core.mode`) plus a person.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
@@ -145,6 +145,23 @@ class Examinable(Protocol):
 
     def examine(self, period_ns: int) -> Iterator[Finding]:
         """What is found, as it is found. Opens the link and closes it; raises nothing of the robot's or the wire's."""
+
+
+@runtime_checkable
+class Serviceable(Protocol):
+    """A driver whose drives a person serves while nothing runs, for `asc drives`. Optional. Nothing is enabled by it.
+
+    Each opens the link and closes it, and raises nothing of the robot's or the wire's.
+    """
+
+    def drives(self, period_ns: int) -> Iterator[Finding]:
+        """How each drive is."""
+
+    def reset(self, period_ns: int, axes: Sequence[int], supported: bool) -> Iterator[Finding]:
+        """Reset the faults of these axes, counted from 1; `supported`: the person holds what has no brake."""
+
+    def assign(self, number: int) -> Iterator[Finding]:
+        """Give the one drive that has no number on its bus this one."""
 
 
 class RobotDriver(Protocol):

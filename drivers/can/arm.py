@@ -134,5 +134,11 @@ class ArmCodec(Protocol):
     def guard(self, link: Link, i: int, watchdog_ns: int) -> Finding:
         """Set the watchdog of drive i, and read it back. The stream runs, and waits no longer than a few ms."""
 
+    def reset(self, link: Link, i: int) -> Finding:
+        """Reset the fault of drive i, and see that it is over and that the drive stays disabled. Nothing streams."""
+
+    def assign(self, link: Link, number: int) -> Finding:
+        """Give the drive that has no number on the bus this one. Nothing streams."""
+
     def leave(self) -> list[Frame]:
         """Said once the arm is at rest and its power is off, or left on where nothing else holds it."""

@@ -19,8 +19,8 @@ from canopen import SdoCommunicationError
 from canopen.sdo.exceptions import SdoError
 
 from asc_rt.core.types import CommandKind
-from drivers.base import Finding
-from drivers.can import cia402
+from drivers.base import Finding, ProtocolError
+from drivers.can import cia402, lss
 from drivers.can.arm import Brake, Emergency, Feedback, Heard, Heartbeat, Joint, Power, Target, Wish
 from drivers.can.bus_load import FrameSize
 from drivers.can.cia402 import Control, Mode, Nmt, PowerState, Scale, StatusFlag
@@ -32,6 +32,7 @@ from drivers.can.sdo import Service, answers
 MASTER = 127  # our own node number, as the drives watch it
 BEAT = 3  # cycles between our heartbeats
 SCAN_NODES = range(1, 16)
+BOOT_NS = 200_000_000  # a node that begins anew is back by then, ASSUMED
 RPDO2_BASE, RPDO3_BASE = 0x300, 0x400
 RPDO2_MAP = (0x6040_0010, 0x6060_0008, 0x60B2_0010)
 RPDO3_MAP = (0x60FF_0020,)
@@ -147,8 +148,13 @@ class Cia402Arm:
         counts = {node: answers(link, node) for node in SCAN_NODES}
         wrong = [f"node {n}: {c} answers" for n, c in counts.items() if c != int(n in self.nodes)]
         detail = "; ".join(wrong) or f"{len(self.nodes)} nodes, one answer each"
-        yield Finding("scan", not wrong, detail, "check power, cabling and that no two drives have one node number")
-        if wrong:
+        fix = "check power, cabling and that no two drives have one node number"
+        nameless = lss.is_nameless_there(link)
+        if nameless:
+            detail += "; a drive that has no node number"
+            fix = "see that it is the right one, then asc drives CELL --assign NODE"
+        yield Finding("scan", not wrong and not nameless, detail, fix)
+        if wrong or nameless:
             return
         for i, node in enumerate(self.nodes):
             try:
@@ -199,6 +205,37 @@ class Cia402Arm:
             wanted[0x60FE, 2] = SET_BRAKE
         return _write(f"{name} settings", node, wanted)
 
+    def reset(self, link: Link, i: int) -> Finding:
+        """By service data, because no SYNC goes. After a loss of communication a drive may want its communication to be
+        reset first."""
+        number, name = self.nodes[i], f"axis {i + 1} reset"
+        try:
+            state = _reset(Service(link, number))
+            if state is PowerState.FAULT:
+                link.send([Frame(cia402.NMT_ID, cia402.encode_nmt(Nmt.RESET_COMMUNICATION, number))])
+                _wait(link, BOOT_NS)
+                state = _reset(Service(link, number))
+        except (SdoError, SdoCommunicationError, ProtocolError) as error:
+            return Finding(name, False, str(error), "check the cable of the drive")
+        ok = state is PowerState.SWITCH_ON_DISABLED
+        words = state.name.replace("_", " ").lower()
+        fix = "the cause is not over; if the drive is enabled, switch its power off"
+        return Finding(name, ok, f"it is {words}", fix)
+
+    def assign(self, link: Link, number: int) -> Finding:
+        if number not in self.nodes:
+            return Finding("number", False, f"{number} is no node of this arm", f"one of {list(self.nodes)}")
+        if answers(link, number):
+            return Finding("number", False, f"node {number} is there already", "asc drives tells which one is missing")
+        try:
+            identity = lss.assign(link, number)
+        except lss.LssError as error:
+            return Finding("number", False, str(error), "one drive without number on the bus at a time, and in reach")
+        _wait(link, BOOT_NS)
+        told = answers(link, number)
+        detail = f"{told} answers as node {number}: vendor, product, revision, serial {identity}"
+        return Finding("number", told == 1, detail, "switch the drive off and on, and look again: asc drives")
+
     def guard(self, link: Link, i: int, watchdog_ns: int) -> Finding:
         ms = watchdog_ns // 1_000_000
         wanted = {
@@ -210,6 +247,13 @@ class Cia402Arm:
             return _write(f"axis {i + 1} watchdog", Service(link, self.nodes[i]), wanted)
         except (SdoError, SdoCommunicationError) as error:
             return Finding(f"axis {i + 1} watchdog", False, str(error), "the drive does not take its time-outs")
+
+
+def _reset(node: Service) -> PowerState:
+    """A rising edge of bit 7, then none; the state after it."""
+    for word in (Control.DISABLE_VOLTAGE, cia402.FAULT_RESET, Control.DISABLE_VOLTAGE):
+        node[0x6040].raw = int(word)
+    return PowerState.of(node[0x6041].raw)
 
 
 def _limits(name: str, node: Service, scale: Scale, joint: Joint) -> Finding:
@@ -235,6 +279,13 @@ def _map(node: Service, communication: int, cob_id: int, entries: Sequence[int])
         node[mapping][k + 1].raw = entry
     node[mapping][0].raw = len(entries)
     node[communication][1].raw = cob_id
+
+
+def _wait(link: Link, ns: int) -> None:
+    """And hear nothing of what is said meanwhile."""
+    deadline_ns = link.now_ns() + ns
+    while link.receive(deadline_ns) is not None:
+        pass
 
 
 def _write(name: str, node: Service, wanted: dict[tuple[int, int], int]) -> Finding:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from enum import Enum, auto
@@ -24,7 +24,7 @@ from drivers.base import (
     WireTap,
     WriteReceipt,
 )
-from drivers.can import bus_load, export, home, start_up
+from drivers.can import bus_load, export, home, service, start_up
 from drivers.can.arm import Feedback, Power, Target
 from drivers.can.arms import ARMS
 from drivers.can.cia402 import PowerState
@@ -110,8 +110,32 @@ class Can:
 
     def examine(self, period_ns: int) -> Iterator[Finding]:
         """The start-up checklist as far as nothing is enabled by it."""
+        yield from self._alone(self._examine(period_ns))
+
+    def drives(self, period_ns: int) -> Iterator[Finding]:
+        """See `drivers.base.Serviceable`."""
+        yield from self._alone(service.tell(self._link, self._codec, self._options, period_ns))
+
+    def reset(self, period_ns: int, axes: Sequence[int], supported: bool) -> Iterator[Finding]:
+        """See `drivers.base.Serviceable`."""
+        n = len(self._codec.joints)
+        if wrong := [axis for axis in axes if not 1 <= axis <= n]:
+            yield Finding("axis", False, f"{wrong} of {n}", f"axes count from 1 to {n}")
+            return
+        which = [axis - 1 for axis in axes]
+        yield from self._alone(service.reset(self._link, self._codec, self._options, period_ns, which, supported))
+
+    def assign(self, number: int) -> Iterator[Finding]:
+        """See `drivers.base.Serviceable`."""
+        yield from self._alone(service.assign(self._link, self._codec, self._options, number))
+
+    def _alone(self, lines: Iterator[Finding]) -> Iterator[Finding]:
+        """On a bus of which nobody else on this machine is the master."""
         try:
-            yield from self._examine(period_ns)
+            self._lock.acquire()
+            yield from lines
+        except DriverError as error:
+            yield Finding("owner", False, str(error), error.hint)
         finally:
             self.close()
 

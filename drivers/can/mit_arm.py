@@ -17,6 +17,7 @@ from drivers.can.link import Link
 
 ANSWER_NS = 20_000_000  # for a register; a drive takes less than 1 ms
 SCAN_IDS = range(1, 16)
+RESET_LOOKS = 5
 TIMEOUT_UNIT_NS = 50_000
 MIT_MODE = 1
 
@@ -127,6 +128,25 @@ class MitArm:
         detail = f"{told} x 50 us, expected {wanted}"
         fix = "the drive does not take its time-out: do not use it"
         return Finding(f"axis {i + 1} watchdog", told == [wanted], detail, fix)
+
+    def reset(self, link: Link, i: int) -> Finding:
+        axis = self.axes[i]
+        link.send([Frame(axis.command_id, mit.special(mit.Special.CLEAR_ERROR), self.is_fd)])
+        told: Feedback | None = None
+        for _ in range(RESET_LOOKS):  # a cause that is still there trips it again
+            link.send([Frame(mit.REGISTER_ID, mit.refresh(axis.command_id), self.is_fd)])
+            deadline_ns = link.now_ns() + ANSWER_NS
+            while (frame := link.receive(deadline_ns)) is not None:
+                heard = self.decode(frame)
+                told = heard[1] if heard is not None and heard[0] == i and isinstance(heard[1], Feedback) else told
+        words = told.words if told else "silent"
+        ok = told is not None and told.power is Power.DISABLED
+        fix = "the cause is not over; if the drive is enabled, switch its power off"
+        return Finding(f"axis {i + 1} reset", ok, f"it is {words}", fix)
+
+    def assign(self, link: Link, number: int) -> Finding:
+        fix = "set CAN ID and master ID with the maker's tool, this drive alone on the bus"
+        return Finding("number", False, "these drives take no number over this bus", fix)
 
     def _scan(self, link: Link) -> Finding:
         """Reads a register of every identifier: nothing is enabled, as by an enable frame used as a ping."""

@@ -50,7 +50,7 @@ class Rule:
     is_axis: bool = True  # of one axis, which then is not commanded along the path any more
 
 
-_POWER_UP = "find the cause, then start the session anew: nothing is reset by itself"
+_POWER_UP = "find the cause, then asc drives CELL --reset AXIS and start the session anew: nothing is reset by itself"
 
 RULES = {
     Fault.MISSED: Rule(Reaction.WARN, "look at bus load and cabling if it comes often", is_axis=False),

@@ -16,7 +16,7 @@ from drivers.can.link import Link
 from drivers.can.options import Options
 from drivers.can.stream import Stream, hold, look
 
-BUS = "robot"  # name of the line that says whether anybody is there
+BUS, LISTEN = "robot", "listen"  # names of the lines that say whether anybody is there, and nobody else
 LEAST_QUEUE, FD_MTU = 64, 72  # frames that the interface holds for us, two cycles' and more; bytes of one of CAN FD
 LISTENED = 16  # frames of others that are told by identifier
 REHEARSAL = 50  # cycles before anything is enabled
@@ -30,6 +30,20 @@ SAG = 0.05  # rad that the arm may give way when it is enabled
 
 def examine(link: Link, codec: ArmCodec, options: Options, period_ns: int) -> Iterator[Finding]:
     """Opens the link and leaves it open. Raises nothing of the wire's."""
+    yield _load(codec, period_ns)
+    yield _silence(codec)
+    for line in examine_bus(link, codec, options):
+        yield line
+        if not line.ok and line.name in (BUS, LISTEN):  # what is asked next would disturb the session of the other one
+            return
+    yield from codec.start_up(link, period_ns, options.serials)
+    h = link.health
+    wrong = [name for name in ("passive", "off", "unacknowledged", "backlog", "gone") if getattr(h, name)]
+    yield Finding("bus state", not wrong, ", ".join(wrong) or "error active", "check termination, cabling and power")
+
+
+def examine_bus(link: Link, codec: ArmCodec, options: Options) -> Iterator[Finding]:
+    """Is it there, at the right speed, and ours alone? Says nothing on it."""
     try:
         link.open()
     except LinkError as error:
@@ -37,13 +51,7 @@ def examine(link: Link, codec: ArmCodec, options: Options, period_ns: int) -> It
         return
     yield Finding(BUS, True, f"{options.interface} {options.channel} is open")
     yield bit_timing(codec, options.interface, options.channel)
-    yield _load(codec, period_ns)
-    yield _silence(codec)
     yield _listen(link, options)
-    yield from codec.start_up(link, period_ns, options.serials)
-    h = link.health
-    wrong = [name for name in ("passive", "off", "unacknowledged", "backlog", "gone") if getattr(h, name)]
-    yield Finding("bus state", not wrong, ", ".join(wrong) or "error active", "check termination, cabling and power")
 
 
 def bit_timing(codec: ArmCodec, interface: str, channel: str) -> Finding:
@@ -106,7 +114,7 @@ def _listen(link: Link, options: Options) -> Finding:
         if not 0x700 <= frame.id < 0x780:  # heartbeats and boot-ups of CANopen
             heard.append(frame.id)
     ids = ", ".join(f"{i:03X}h" for i in sorted(set(heard))[:LISTENED])
-    return Finding("listen", not heard, f"others send {ids}" if heard else "silence", "take the other master off")
+    return Finding(LISTEN, not heard, f"others send {ids}" if heard else "silence", "take the other master off")
 
 
 def enable(stream: Stream, options: Options, dynamics: Dynamics) -> Iterator[Finding]:
@@ -145,7 +153,7 @@ def _rehearse(stream: Stream) -> Finding:
         for i, (axis, power) in enumerate(zip(stream.axes, powers, strict=True))
         if power not in may[: 1 if stream.codec.joints[i].has_brake else 2]
     ]
-    fix = "a person looks for the cause and resets the drive: nothing is reset by itself"
+    fix = "find the cause; then a person resets the drive: asc drives CELL --reset AXIS. Nothing is reset by itself"
     _checked(Finding("power", not wrong, ", ".join(wrong) or "as it was left, and without fault", fix))
     lost = max(axis.lost for axis in stream.axes)
     detail = "; ".join([f"{lost} of {REHEARSAL} answers of an axis lost", *map(str, stream.found)])

@@ -11,6 +11,7 @@ import math
 import struct
 from dataclasses import dataclass
 
+from sim_hil.can import lss
 from sim_hil.can.frames import Frame
 
 NOT_READY, DISABLED, READY, ON, ENABLED, QUICK_STOP, FAULT = 0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
@@ -58,6 +59,8 @@ class Cia402Drive:
         self.contact_stuck: bool | None = None  # what its contact tells, whatever it does
         self.q = self.dq = self.tau = 0.0
         self._od = _objects(node, data)
+        vendor, product, revision, serial = (self._od[0x1018, k] for k in (1, 2, 3, 4))
+        self.lss = lss.Lss((vendor, product, revision, serial), node)
         self._staged: dict[int, bytes] = {}
         self._say: list[Frame] = []
         self._master_ns = self._beat_ns = self._settled_ns = 0
@@ -66,6 +69,7 @@ class Cia402Drive:
         self._ramp: tuple[float, float, float] | None = None  # q, dq, seconds of a quick stop
         self._last_target = 0.0
         self._word = 0
+        self._needs_new_communication = False  # after a loss of it, before a fault can be reset
 
     @property
     def is_enabled(self) -> bool:
@@ -82,6 +86,10 @@ class Cia402Drive:
 
     def hear(self, frame: Frame) -> list[Frame]:
         data = frame.data
+        if frame.id == lss.MASTER_ID and len(data) == 8:
+            return self._out(self._number(data))
+        if self.node == lss.NO_NUMBER:
+            return []
         if frame.id == 0x000 and len(data) == 2 and data[1] in (0, self.node):
             self._manage(data[0])
         elif frame.id == 0x080 and self.nmt == OPERATIONAL:
@@ -96,6 +104,19 @@ class Cia402Drive:
                     self._staged[0x1600 + k] = data
                     self._rpdo_ns[k] = 0
         return []
+
+    def _number(self, data: bytes) -> list[Frame]:
+        answer = self.lss.hear(data)
+        if self.lss.number != self.node:
+            self.be(self.lss.number)
+        return [] if answer is None else [Frame(lss.NODE_ID, answer)]
+
+    def be(self, number: int) -> None:
+        """Begin anew as this node."""
+        self.node, self.lss.number, self.nmt = number, number, PRE_OPERATIONAL
+        self._od = _objects(number, self.data)
+        if number != lss.NO_NUMBER:
+            self._say.append(Frame(0x700 + number, bytes([BOOT])))
 
     def speak(self, elapsed_ns: int) -> list[Frame]:
         self._beat_ns += elapsed_ns
@@ -115,6 +136,7 @@ class Cia402Drive:
         self.nmt = change.get(command, self.nmt)
         self._master_ns, self._rpdo_ns = 0, [0] * 4
         if command == 0x82:
+            self._needs_new_communication = False
             self._say.append(Frame(0x700 + self.node, bytes([BOOT])))
 
     def _sync(self) -> list[Frame]:
@@ -172,6 +194,8 @@ class Cia402Drive:
             return struct.pack("<BHBI", 0x80, index, sub, READ_ONLY)
         size = 4 - (command >> 2 & 3) if command & 1 else 4
         self._od[key] = int.from_bytes(data[4 : 4 + size], "little", signed=_signed(index, sub))
+        if index == 0x6040:
+            self._control(self._od[key])
         return struct.pack("<BHB4x", 0x60, index, sub)
 
     def _read(self, index: int, sub: int) -> bytes:
@@ -190,8 +214,8 @@ class Cia402Drive:
         reset = word & 0x80 and not self._word & 0x80
         self._word = word
         if self.state == FAULT:
-            if reset and self.voltage:
-                self.state = DISABLED
+            if reset and self.voltage and not self._needs_new_communication and self.coil_c < TRIP_C:
+                self.state, self._od[0x603F, 0] = DISABLED, 0
         elif not word & 0x02:
             self.state = DISABLED
         elif not word & 0x04:
@@ -221,6 +245,9 @@ class Cia402Drive:
     def cut_power(self) -> None:
         self.voltage, self.state = False, DISABLED
 
+    def restore_power(self) -> None:
+        self.voltage, self.is_silent = True, False
+
     def trip_over_current(self) -> None:
         self._fail(EMCY["current"])
 
@@ -235,6 +262,9 @@ class Cia402Drive:
             self.contact_stuck = closed
         else:
             self.brake_stuck = closed
+
+    def forget_number(self) -> None:
+        self.be(lss.NO_NUMBER)
 
     def ignore_targets(self) -> None:
         self.is_deaf = True
@@ -262,6 +292,7 @@ class Cia402Drive:
         watched += [(0x8250, self._od[0x1400 + k, 5], age_ns) for k, age_ns in enumerate(self._rpdo_ns)]
         for code, limit_ms, age_ns in watched:
             if limit_ms and age_ns > limit_ms * 1_000_000 and self.state == ENABLED:
+                self._needs_new_communication = True
                 if self.data.holds:
                     self._emergency(code)
                     self._begin_stop()

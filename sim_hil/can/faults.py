@@ -51,6 +51,10 @@ def _safe_torque_off(line: Line, i: int, value: float) -> None:
     line.drives[i].cut_power()
 
 
+def _power_on(line: Line, i: int, value: float) -> None:
+    line.drives[i].restore_power()
+
+
 def _trip(line: Line, i: int, value: float) -> None:
     line.drives[i].trip_over_current()
 
@@ -65,6 +69,15 @@ def _stops(line: Line, i: int, value: float) -> None:
 
 def _deaf(line: Line, i: int, value: float) -> None:
     line.drives[i].ignore_targets()
+
+
+def _number(line: Line, i: int, value: float) -> None:
+    line.drives[i].forget_number()
+
+
+def _stand(line: Line, i: int, value: float) -> None:
+    """A stand carries the arm until every drive has power again."""
+    line.on_stand = True
 
 
 def _brake(line: Line, i: int, value: float) -> None:
@@ -120,10 +133,13 @@ FAULTS: dict[str, Action] = {
     "heartbeat": _heartbeat,
     "power_cut": _power_cut,
     "safe_torque_off": _safe_torque_off,
+    "power_on": _power_on,
     "trip": _trip,
     "emergency": _emergency,  # value: code of the EMCY
     "stops": _stops,
     "deaf": _deaf,
+    "number": _number,
+    "stand": _stand,
     "brake": _brake,  # value: 1 stays closed, 0 open
     "contact": _contact,  # value: 1 tells closed, 0 open
     "disable": _disable,
@@ -184,7 +200,7 @@ def check_axes(script: Sequence[Fault], axes: int) -> None:
 # What else would be no frame, or no number of frames.
 _VALUES = {"lose": (0, 1e6), "corrupt": (0, 1e6), "late": (0, 1e3), "babble": (0, 0x7FF), "emergency": (0, 0xFFFF)}
 _VALUES["hot"] = (0, 255)  # as much as the answer has bits for
-_OF_THE_BUS = ("corrupt", "unplug", "babble")
+_OF_THE_BUS = ("corrupt", "unplug", "babble", "stand")
 
 
 parse_script = partial(fault_script.parse, kind=Fault)

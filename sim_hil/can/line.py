@@ -32,6 +32,7 @@ class Drive(Protocol):
     heart_stopped: bool  # its cyclic answers go on, its heartbeat does not
 
     def cut_power(self) -> None: ...
+    def restore_power(self) -> None: ...
     def trip_over_current(self) -> None: ...
     def say_emergency(self, code: int) -> None:
         """And go on as if nothing were."""
@@ -39,6 +40,9 @@ class Drive(Protocol):
     def stop_by_itself(self) -> None: ...
     def jam_brake(self, closed: bool, contact: bool) -> None:
         """It, or its contact only, stays so."""
+
+    def forget_number(self) -> None:
+        """As it comes from its maker."""
 
     def ignore_targets(self) -> None:
         """And tell so."""

@@ -43,6 +43,7 @@ class MitDrive:
         self.state = DISABLED
         self.coil_c, self.age = 30.0, 0.0  # deg C; s since the tick
         self.offset = self.drift = 0.0  # rad that the encoder is off; rad/s
+        self.voltage = True
         self.is_silent = self.heart_stopped = False  # this kind of drive has no heartbeat
         self.q = self.dq = self.tau = 0.0
         self._target: tuple[float, float, float, float, float] | None = None  # q dq kp kd tau
@@ -83,7 +84,7 @@ class MitDrive:
         return self._answer()
 
     def _special(self, kind: int) -> None:
-        if kind == 0xFB and self.state > ENABLED:
+        if kind == 0xFB and self.state > ENABLED and self.voltage and self.coil_c < TRIP_C:
             self.state, self._target, self._hold = DISABLED, None, None
         elif kind == 0xFC and self.state == DISABLED:
             self.state, self._target = ENABLED, None
@@ -130,7 +131,12 @@ class MitDrive:
 
     def cut_power(self) -> None:
         """Safe torque off: the voltage is gone; the electronics live on."""
+        self.voltage = False
         self.trip(UNDER_VOLTAGE)
+
+    def restore_power(self) -> None:
+        """It is told of as before, until somebody clears it."""
+        self.voltage, self.is_silent = True, False
 
     def trip_over_current(self) -> None:
         self.trip(OVER_CURRENT)
@@ -143,6 +149,9 @@ class MitDrive:
 
     def jam_brake(self, closed: bool, contact: bool) -> None:
         """There is none."""
+
+    def forget_number(self) -> None:
+        """It has always one."""
 
     def ignore_targets(self) -> None:
         """It has no such flag."""

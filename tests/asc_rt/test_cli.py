@@ -97,6 +97,17 @@ def test_doctor_names_what_it_checked_and_what_to_do(asc: Any) -> None:
     assert all(check["ok"] or check["fix"] for check in told["checks"])
 
 
+def test_drives_tells_what_cannot_be_served(asc: Any) -> None:
+    code, _, err = asc("drives", "fanuc-sim")
+    assert code == 2 and "not served from here" in err[0]
+    code, _, err = asc("drives", "openarm-sim", "--reset", "3", "--assign", "3")
+    assert code == 2 and "one at a time" in err[0]
+    code, out, _ = asc("drives", "openarm-sim", "--set", "driver.channel=nobody-serves-this", "--reset", "3", "--json")
+    checks = json.loads(out.splitlines()[-1])["checks"]
+    assert code == 1 and [check["name"] for check in checks if not check["ok"]] == ["robot"]
+    assert checks[-1]["name"] == "robot" and checks[-1]["fix"]
+
+
 def test_doctor_tells_every_fault_of_a_cell(asc: Any, tmp_path: Path) -> None:
     bad = tmp_path / "bad.toml"
     bad.write_text((ROOT / "asc_rt/cells/fanuc-sim.toml").read_text().replace("d_min_m = 0.10", "d_min_m = -1"))

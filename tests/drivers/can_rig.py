@@ -47,6 +47,7 @@ class Rig:
             bus = SimulatedBus(name, line=self.line)
             return bus if interface == "asc-sim" else cast(can.BusABC, Through(interface, data.data_bitrate > 0.0, bus))
 
+        self.table, self.open_bus = table, open_bus
         self.driver = Can(table, tap, open_bus, self.now_ns)
         self.period_ns = round(table.get("period_ms", 4.0) * 1e6)
         self._due_ns = 0

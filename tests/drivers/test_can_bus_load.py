@@ -47,6 +47,15 @@ def test_what_fits_is_taken() -> None:
     assert load([FrameSize(8, is_fd=True), FD] * 7, 0.002, 1e6, 5e6) == pytest.approx(0.7126)  # command without BRS
 
 
+def test_lengths_are_told_with_the_kind_of_frame() -> None:
+    with pytest.raises(ValueError, match="no CAN FD frame has 10 data bytes"):
+        FrameSize(10, is_fd=True)
+    with pytest.raises(ValueError, match="no CAN frame has 10 data bytes"):
+        FrameSize(10)
+    with pytest.raises(ValueError, match="29-bit identifiers are not in the formulas"):
+        FrameSize(8, is_fd=True, is_extended=True)
+
+
 @pytest.mark.parametrize(
     "wrong", [{"length": 9}, {"length": -1}, {"length": 10, "is_fd": True}, {"length": 8, "switches_rate": True}]
 )

@@ -133,6 +133,25 @@ def test_what_a_brake_tells(data: str, closed: bool | None) -> None:
     assert ARMS["panda"].decode(Frame(0x583, bytes.fromhex(data))) == (2, Brake(closed))
 
 
+def test_what_just_fits_and_what_just_does_not() -> None:
+    """One count a radian and a thousandth of a newton metre a unit: the figures are the wire's."""
+    plain = Scale(resolution=1, gear=Fraction(1), rated_torque=1.0)
+    for most, say in (
+        ((1 << 31) - 1, lambda v: plain.counts(v * 2 * math.pi)),
+        ((1 << 31) - 1, lambda v: plain.counts_per_second(v * 2 * math.pi)),
+        ((1 << 15) - 1, lambda v: plain.per_mille(v * 1e-3)),
+    ):
+        assert say(most) == most and say(-most - 1) == -most - 1
+        for beyond in (most + 1, -most - 2):
+            with pytest.raises(ValueError, match="does not fit"):
+                say(beyond)
+
+
+def test_a_speed_in_counts_of_the_motor() -> None:
+    scale = Scale(resolution=4096, gear=Fraction(101), rated_torque=12.0, sign=-1, zero=5000)
+    assert scale.counts_per_second(2 * math.pi) == -TURN, "the zero is of positions only"
+
+
 def test_node_control_and_its_news() -> None:
     assert cia402.encode_nmt(Nmt.START, 3) == b"\x01\x03"
     assert cia402.decode_heartbeat(b"\x05") is NodeState.OPERATIONAL

@@ -123,6 +123,7 @@ def test_every_trip_is_a_fault(status: DriveStatus) -> None:
 def test_registers() -> None:
     assert mit.read_register(0x05, Register.POSITION_SPAN).hex() == "05003315" + "00000000"
     assert mit.write_register(0x05, Register.TIMEOUT, 1000).hex() == "05005509" + "e8030000"
+    assert mit.write_register(0x05, Register.VELOCITY_SPAN, 10.5).hex() == "05005516" + struct.pack("<f", 10.5).hex()
     answer = struct.pack("<HBBf", 5, 0x33, 21, 12.5)
     assert mit.decode_register(5, answer) == (Register.POSITION_SPAN, 12.5)
     assert mit.decode_register(6, answer) is None
