@@ -22,7 +22,7 @@ from asc_rt.synthesis import command as synthesis
 from calibration import command as calibration
 from logs import commands
 
-DEFAULT_CELL = "fanuc-sim"
+DEFAULT_CELL = "fanuc-sim-seeing"
 BAD_INPUT = 2
 
 app = typer.Typer(

@@ -22,7 +22,7 @@ from sim_hil.depth import UNIT, Eye, Optics, Scene
 from sim_hil.person import Array
 from sim_hil.seeing import PERIOD, VOXEL, lens_of
 
-WIDTHS = (0.03, 0.04, 0.055, 0.07, 0.1, 0.16)  # m
+WIDTHS = (0.005, 0.015, 0.03, 0.04, 0.055, 0.07, 0.1, 0.16)  # m
 RANGES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5)  # m from the camera
 PICTURES = {"640x480": Optics(640, 480, 525.0, 525.0), "160x120": Optics()}  # a Kinect's; the simulated cell's
 CAMERA, TARGET = np.array([3.2, 1.6, 0.4]), (0.0, 1.6, 0.2)  # m

@@ -65,6 +65,12 @@ def test_bad_input_is_one_line_and_exit_code_2(asc: Any, words: list[str], says:
     assert len(err) == 1 and err[0].startswith("error: ") and says in err[0]
 
 
+def test_the_cell_that_runs_without_a_name_sees() -> None:
+    cell = load_cell(cli.DEFAULT_CELL)
+    assert cell.simulated and cell.perception is not None
+    assert cell.sim["human"]["rate_hz"] == 0, "nobody tells it where people are"
+
+
 def test_every_fault_of_a_cell_is_told(asc: Any) -> None:
     code, _, err = asc("run", "--set", "safety.d_min_m=-1", "--set", "task.spede=1")
     assert code == 2
