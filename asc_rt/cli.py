@@ -22,7 +22,7 @@ from asc_rt.synthesis import command as synthesis
 from calibration import command as calibration
 from logs import commands
 
-DEFAULT_CELL = "fanuc-sim-seeing"
+DEFAULT_CELL = "fanuc-sim"
 BAD_INPUT = 2
 
 app = typer.Typer(
@@ -132,7 +132,7 @@ def perceive(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """The perception process alone. Example: asc perceive fanuc-sim-seeing"""
+    """The perception process alone. Example: asc perceive fanuc-sim"""
     from asc_rt.config import load_cell
     from asc_rt.processes import run_perception
 

@@ -63,7 +63,7 @@ def lens_of(optics: Optics) -> Intrinsics:
 
 @lru_cache(maxsize=1)
 def studio() -> Studio:
-    params, optics = load_cell("fanuc-sim").params, Optics()
+    params, optics = load_cell("fanuc-sim-truth").params, Optics()
     scene, poses = Scene(params), [look_at(eye, TARGET) for eye in EYES]
     eyes = [Eye(scene, pose, optics, i) for i, pose in enumerate(poses)]
     grid = Grid.over(np.array(VOLUME[0]), np.array(VOLUME[1]), VOXEL)
@@ -183,7 +183,7 @@ def main(argv: list[str]) -> int:
     if options.faults:
         from sim_hil import seeing_faults
 
-        rows = seeing_faults.table("fanuc-sim-seeing")
+        rows = seeing_faults.table("fanuc-sim")
         print(json.dumps(rows))
         return 0 if len(rows) == sum(map(len, seeing_faults.SESSIONS)) and all(map(seeing_faults.is_safe, rows)) else 1
     seeds = [options.seed * 100_000 + i for i in range(options.n)]

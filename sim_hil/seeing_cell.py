@@ -40,7 +40,7 @@ from sim_hil.seeing import lens_of
 from sim_hil.trials.episode import Arm, Armer
 from sim_hil.trials.judge import Judge, Outcome
 
-CELL = "fanuc-sim-seeing"
+CELL = "fanuc-sim"
 START_NS = 10**12
 BATCH_NS = 24_000_000  # of joints, from the logger
 LEAST_LATENCY_NS = 20_000_000  # as the cameras declare it

@@ -51,7 +51,7 @@ class Bench:
 
 @lru_cache(maxsize=1)
 def bench(picture: str) -> Bench:
-    optics, params = PICTURES[picture], load_cell("fanuc-sim").params
+    optics, params = PICTURES[picture], load_cell("fanuc-sim-truth").params
     scene, pose = Scene(params), look_at(CAMERA, TARGET)
     scene.pose(POSE)
     eye = Eye(scene, pose, optics, 1)

@@ -24,7 +24,7 @@ from asc_rt.config import load_cell
 from asc_rt.core.system import System
 from asc_rt.core.warm import warm_up
 
-for cell in ("fanuc-sim", "panda-torque-sim"):  # one of each control level
+for cell in ("fanuc-sim-truth", "panda-torque-sim"):  # one of each control level
     warm_up(System(load_cell(cell).params))
 """
 

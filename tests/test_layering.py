@@ -134,7 +134,7 @@ def test_each_library_is_imported_where_it_lives(module: str, homes: list[str]) 
 
 def test_starting_the_control_process_loads_nothing_heavy() -> None:
     code = (
-        "import sys, asc_rt.control; from asc_rt.config import load_cell; load_cell('fanuc-sim');"
+        "import sys, asc_rt.control; from asc_rt.config import load_cell; load_cell('fanuc-sim-truth');"
         "print(*sorted({m.partition('.')[0] for m in sys.modules}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)

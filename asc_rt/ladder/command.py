@@ -13,7 +13,7 @@ from typing import Any
 
 from asc_rt import launch
 
-DEFAULT_CELL = "fanuc-sim"
+DEFAULT_CELL = "fanuc-sim-truth"
 
 
 def main(argv: list[str]) -> int:

@@ -39,7 +39,7 @@ POLICIES = ("asc", "none")
 # Chosen by measurement, on 16 draws of panda+ee1 (nearest approach, median time to the goal): k = 0.3: 49.6 mm, 3.29 s;
 # 0.6: 49.6 mm, 3.44 s; 1: 50.2 mm, 3.59 s; 2: 52.6 mm, 3.78 s. Under 1 the sampled control gets 0.4 mm inside d_min.
 K_TORQUE = 2.0
-K_PERSON = 3.0  # of the cell fanuc-sim
+K_PERSON = 3.0  # of the cell fanuc-sim-truth
 
 WAY_CLEARANCE = 0.02  # m more than d_min, of the ways that the planner offers
 SEARCH = 4000  # branches: without a way after these there is none

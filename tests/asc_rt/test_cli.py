@@ -104,7 +104,7 @@ def test_doctor_names_what_it_checked_and_what_to_do(asc: Any) -> None:
 
 
 def test_drives_tells_what_cannot_be_served(asc: Any) -> None:
-    code, _, err = asc("drives", "fanuc-sim")
+    code, _, err = asc("drives", "fanuc-sim-truth")
     assert code == 2 and "not served from here" in err[0]
     code, _, err = asc("drives", "openarm-sim", "--reset", "3", "--assign", "3")
     assert code == 2 and "one at a time" in err[0]
@@ -116,14 +116,14 @@ def test_drives_tells_what_cannot_be_served(asc: Any) -> None:
 
 def test_doctor_tells_every_fault_of_a_cell(asc: Any, tmp_path: Path) -> None:
     bad = tmp_path / "bad.toml"
-    bad.write_text((ROOT / "asc_rt/cells/fanuc-sim.toml").read_text().replace("d_min_m = 0.10", "d_min_m = -1"))
+    bad.write_text((ROOT / "asc_rt/cells/fanuc-sim-truth.toml").read_text().replace("d_min_m = 0.10", "d_min_m = -1"))
     code, out, _ = asc("doctor", str(bad), "--json")
     (cell,) = [check for check in json.loads(out)["checks"] if check["name"] == "cell"]
     assert code == 1 and not cell["ok"] and "-1 m" in cell["detail"]
 
 
 def test_bench_measures_scenes_with_the_number_of_pairs_that_it_claims() -> None:
-    params = load_cell("fanuc-sim").params
+    params = load_cell("fanuc-sim-truth").params
     for pairs in bench.PAIRS[:2]:
         scene = bench.Scene(params, pairs)
         counts = set()

@@ -20,7 +20,7 @@ from asc_rt.core.params import Params
 from calibration import result as calibration
 
 
-def faults(cell: str | Path = "fanuc-sim", *overrides: str) -> tuple[str, ...]:
+def faults(cell: str | Path = "fanuc-sim-truth", *overrides: str) -> tuple[str, ...]:
     with pytest.raises(ConfigError) as caught:
         load_cell(cell, overrides)
     assert all("\n" not in line for line in caught.value.lines)
@@ -29,7 +29,7 @@ def faults(cell: str | Path = "fanuc-sim", *overrides: str) -> tuple[str, ...]:
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the data files that a test may spoil; `fanuc-sim` means the copy."""
+    """A copy of the data files that a test may spoil; `fanuc-sim-truth` means the copy."""
     for name in ("cells", "robots"):
         shutil.copytree(config.PACKAGE / name, tmp_path / name)
     monkeypatch.setattr(config, "CELLS", tmp_path / "cells")
@@ -55,7 +55,7 @@ def test_every_cell_that_we_ship_is_in_order(name: str) -> None:
 
 
 def test_files_speak_degrees_and_milliseconds_the_parameters_si() -> None:
-    cell = load_cell("fanuc-sim", ["control.tracking_tolerance_deg=9", "human.age_limit_ms=150", "period_ms=4"])
+    cell = load_cell("fanuc-sim-truth", ["control.tracking_tolerance_deg=9", "human.age_limit_ms=150", "period_ms=4"])
     p = cell.params
     assert (p.period_ns, p.human.age_limit_ns) == (4_000_000, 150_000_000)
     assert p.tracking_tolerance == math.radians(9)
@@ -69,7 +69,7 @@ def test_files_speak_degrees_and_milliseconds_the_parameters_si() -> None:
 
 
 def test_overrides_go_over_the_file_and_are_remembered() -> None:
-    plain, changed = load_cell("fanuc-sim"), load_cell("fanuc-sim", ["safety.d_min_m = 0.12", "tool=bat"])
+    plain, changed = load_cell("fanuc-sim-truth"), load_cell("fanuc-sim-truth", ["safety.d_min_m = 0.12", "tool=bat"])
     assert plain.params.safety.d_min == 0.1
     assert changed.params.safety.d_min == 0.12
     assert changed.params.tool.name == "bat"
@@ -79,12 +79,12 @@ def test_overrides_go_over_the_file_and_are_remembered() -> None:
 
 def test_a_cell_may_be_given_as_a_path(tmp_path: Path) -> None:
     copy = tmp_path / "mine.toml"
-    shutil.copy(CELLS / "fanuc-sim.toml", copy)
+    shutil.copy(CELLS / "fanuc-sim-truth.toml", copy)
     assert load_cell(copy).path == copy
 
 
 def test_the_goals_of_the_cell_are_clear_of_the_mounting_plane() -> None:
-    cell = load_cell("fanuc-sim")
+    cell = load_cell("fanuc-sim-truth")
     robot = cell.params.robot
     model = pin.buildModelFromXML(robot.urdf)
     data = model.createData()
@@ -143,16 +143,16 @@ def test_the_goals_of_the_cell_are_clear_of_the_mounting_plane() -> None:
     ],
 )
 def test_one_wrong_value_is_one_clear_line(override: str, words: list[str]) -> None:
-    lines = faults("fanuc-sim", override)
+    lines = faults("fanuc-sim-truth", override)
     assert len(lines) == 1, lines
     for word in words:
         assert word in lines[0]
 
 
 def test_every_fault_is_told_at_once_and_with_the_file() -> None:
-    lines = faults("fanuc-sim", "safety.d_min_m=-1", "period_ms=5", "tool=dril", "task.spede=1")
+    lines = faults("fanuc-sim-truth", "safety.d_min_m=-1", "period_ms=5", "tool=dril", "task.spede=1")
     assert len(lines) == 4
-    assert all("fanuc-sim.toml: " in line for line in lines)
+    assert all("fanuc-sim-truth.toml: " in line for line in lines)
 
 
 def test_malformed_toml_is_told_with_its_line(tmp_path: Path) -> None:
@@ -171,13 +171,13 @@ def test_unreadable_and_unknown_cells(tmp_path: Path) -> None:
 
 
 def test_only_a_simulated_cell_may_run_uncertified() -> None:
-    assert load_cell("fanuc-sim", ["uncertified=true"]).uncertified
-    lines = faults("fanuc-sim", "simulated=false", "uncertified=true")
+    assert load_cell("fanuc-sim-truth", ["uncertified=true"]).uncertified
+    lines = faults("fanuc-sim-truth", "simulated=false", "uncertified=true")
     assert any("uncertified: this cell is real" in line for line in lines)
 
 
 def test_a_real_cell_has_no_ground_truth() -> None:
-    lines = faults("fanuc-sim", "simulated=false")
+    lines = faults("fanuc-sim-truth", "simulated=false")
     assert any("ground-truth" in line for line in lines)
     assert not any(": sim: " in line for line in lines), "what it is rehearsed with may stay in its file"
 
@@ -210,7 +210,7 @@ def test_a_wrong_robot_or_tool_file_is_told_with_its_name(
     files: Path, file: str, old: str, new: str, words: list[str]
 ) -> None:
     spoil(files / file, old, new)
-    lines = faults("fanuc-sim")
+    lines = faults("fanuc-sim-truth")
     assert any(all(word in line for word in words) and Path(file).name in line for line in lines), lines
 
 
@@ -221,14 +221,14 @@ VALUES = st.one_of(
 
 @given(table=st.sampled_from(["safety", "human", "task", "control", "realtime", "driver", "bus", "sim"]), value=VALUES)
 def test_no_value_of_a_table_makes_the_loader_raise_anything_else(table: str, value: Any) -> None:
-    faults("fanuc-sim", f"{table}={value!r}")
+    faults("fanuc-sim-truth", f"{table}={value!r}")
 
 
 # --- what if ---------------------------------------------------------------------------------------------------------
 
 
 def test_what_if_changes_what_is_asked_and_nothing_else() -> None:
-    params = load_cell("fanuc-sim").params
+    params = load_cell("fanuc-sim-truth").params
     changed = what_if(params, ["safety.d_min_m=0.12"])
     assert changed.safety == dataclasses.replace(params.safety, d_min=0.12)
     assert dataclasses.replace(changed, safety=params.safety) == params
@@ -237,12 +237,12 @@ def test_what_if_changes_what_is_asked_and_nothing_else() -> None:
 @pytest.mark.parametrize("change", ["safety.d_min_m=-1", "safety.dmin=1", "task.speed=0.1", "safety=3"])
 def test_what_if_refuses_what_it_cannot_do(change: str) -> None:
     with pytest.raises(ConfigError):
-        what_if(load_cell("fanuc-sim").params, [change])
+        what_if(load_cell("fanuc-sim-truth").params, [change])
 
 
 # --- a cell that sees ------------------------------------------------------------------------------------------------
 
-SEEING = "fanuc-sim-seeing"
+SEEING = "fanuc-sim"
 
 
 def test_the_messages_of_cameras_carry_the_hash_of_all_their_calibrations(files: Path) -> None:
@@ -288,4 +288,4 @@ def test_what_is_wrong_with_the_cameras_is_one_line_with_its_key(change: str, ke
 
 
 def test_cameras_without_a_perception_table_are_nobodys(files: Path) -> None:
-    assert "human.calibration" in faults("fanuc-sim", "human.calibration=cameras")[0]
+    assert "human.calibration" in faults("fanuc-sim-truth", "human.calibration=cameras")[0]

@@ -84,7 +84,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System(load_cell("fanuc-sim").params)
+    return System(load_cell("fanuc-sim-truth").params)
 
 
 def run(system: System, bench: Bench, operator: Box | None = None) -> CoreState:

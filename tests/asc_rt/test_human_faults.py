@@ -107,7 +107,7 @@ def with_operator(x: CycleInputs, k: int) -> CycleInputs:
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System(load_cell("fanuc-sim", [SENSORS]).params)
+    return System(load_cell("fanuc-sim-truth", [SENSORS]).params)
 
 
 def good(t_ns: int, k: int, **changes: Any) -> bytes:

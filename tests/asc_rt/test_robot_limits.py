@@ -10,7 +10,7 @@ from drivers.base import JointLimits
 
 
 def test_the_smaller_limit_counts_joint_by_joint() -> None:
-    params = load_cell("fanuc-sim").params
+    params = load_cell("fanuc-sim-truth").params
     r = params.robot
     told = JointLimits(*(vector(np.array(own) * [0.5, 2, 1, 1, 1, 0.9]) for own in (r.dq_max, r.ddq_max, r.dddq_max)))
     got = within(params, told)

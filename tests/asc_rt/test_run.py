@@ -37,7 +37,7 @@ class Run:
         self.port = port or free_port(kind=socket.SOCK_DGRAM)
         bus = free_port()
         settings = [f"driver.port={self.port}", f"bus.endpoint=tcp/127.0.0.1:{bus}", "human.age_limit_ms=900"]
-        command = [*ASC, "run", "fanuc-sim", "--json", "--duration", str(duration), "--log", str(self.log)]
+        command = [*ASC, "run", "fanuc-sim-truth", "--json", "--duration", str(duration), "--log", str(self.log)]
         for setting in settings:
             command += ["--set", setting]
         self._err = folder / "stderr"

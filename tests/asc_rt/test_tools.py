@@ -23,7 +23,7 @@ def test_the_cells_own_tool_is_first_and_the_stand_in_last() -> None:
     assert [m.tool.name for m in changer.mounts] == ["bat", "drill", "bare", "enclosing-sphere"]
     assert changer.told_by_robot
     assert not any(m.covered for m in changer.mounts)  # nobody has looked yet
-    assert load_cell("fanuc-sim").params.changer.mounts == ()
+    assert load_cell("fanuc-sim-truth").params.changer.mounts == ()
 
 
 def test_holding_a_tool_is_a_cell_with_that_tool_and_its_speed() -> None:

@@ -51,7 +51,7 @@ def test_one_cell_is_calibrated_within_its_error_bars(cell: tuple[Path, chain.Ju
     eye = load(folder / "hand-eye.json", "hand-eye", mode="640x480", serials={"camera": "S1", "robot": "R1"})
     assert eye.inputs["intrinsics"] == load(folder / "intrinsics.json", "intrinsics").digest.hex()
     assert eye.inputs["poses.csv"] == file_hash(folder / "poses.csv")
-    loaded = load_cell("fanuc-sim", [f"human.calibration={folder}/hand-eye.json"])
+    loaded = load_cell("fanuc-sim-truth", [f"human.calibration={folder}/hand-eye.json"])
     assert loaded.params.human.sensors[0].calibration_hash == hash_number(eye.digest)
     for kind in chain.KINDS:
         report = vision.read(folder / f"{kind}.png")

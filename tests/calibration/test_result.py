@@ -132,14 +132,14 @@ def test_poses_and_their_differences_fit_together(numbers: list[float]) -> None:
 
 def test_a_cell_takes_the_hash_of_an_accepted_file_and_refuses_another(tmp_path: Path) -> None:
     path = saved(tmp_path)
-    cell = load_cell("fanuc-sim", [f"human.calibration={path}"])
+    cell = load_cell("fanuc-sim-truth", [f"human.calibration={path}"])
     assert cell.params.human.sensors[0].calibration_hash == hash_number(GOOD.digest)
     assert read(path).digest == GOOD.digest
     saved(tmp_path, replace(GOOD, reasons=("chi2 9.1",)))
     with pytest.raises(ConfigError, match=r"human.calibration: .*accepted: it was refused: chi2 9.1"):
-        load_cell("fanuc-sim", [f"human.calibration={path}"])
+        load_cell("fanuc-sim-truth", [f"human.calibration={path}"])
     with pytest.raises(ConfigError, match=r"human.calibration: .*serials.camera"):
-        load_cell("fanuc-sim", [f"human.calibration={saved(tmp_path)}", "human.camera=A77"])
+        load_cell("fanuc-sim-truth", [f"human.calibration={saved(tmp_path)}", "human.camera=A77"])
 
 
 def test_the_command_checks_a_file(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from sim_hil import calibration_cell
 from sim_hil.board_camera import Lens
 from sim_hil.depth import Optics
 
-SHIPPED = Path(__file__).parents[2] / "asc_rt" / "cells" / "fanuc-sim-seeing.toml"
+SHIPPED = Path(__file__).parents[2] / "asc_rt" / "cells" / "fanuc-sim.toml"
 BINNING = 4
 EMPTY_CELL = ([0, 0, 0, 0, -90, 0], [90, 20, -20, 0, -60, 0])  # deg: where the arm stands for the background
 
@@ -61,9 +61,9 @@ binning = {BINNING}
 background = "front.npz"
 device = {{ name = "depth-stream", port = {front} }}
 """
-    (folder / "fanuc-sim-seeing").mkdir()
+    (folder / "fanuc-sim").mkdir()
     for name in ("left.json", "right.json"):
-        shutil.copy(SHIPPED.parent / "fanuc-sim-seeing" / name, folder / "fanuc-sim-seeing")
+        shutil.copy(SHIPPED.parent / "fanuc-sim" / name, folder / "fanuc-sim")
     (folder / "certificates").mkdir()
     shutil.copy(SHIPPED.parent / "certificates" / "lrmate_200id-drill.json", folder / "certificates")
     path = folder / "cell.toml"

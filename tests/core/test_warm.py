@@ -8,7 +8,7 @@ from asc_rt.core.system import System
 from asc_rt.core.types import Status
 
 
-@pytest.mark.parametrize("cell", ["fanuc-sim", "openarm-sim", "panda-torque-sim"])
+@pytest.mark.parametrize("cell", ["fanuc-sim-truth", "openarm-sim", "panda-torque-sim"])
 def test_the_filter_has_acted_before_the_robot_is_touched(cell: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or its kernels are loaded in the first cycle that needs them: 30 ms late, with a person in the way."""
     seen, step = set(), warm.step

@@ -39,7 +39,11 @@ from sim_hil.fanuc.settings import Settings
 
 FAR = np.full((1, 3), 50.0)  # m
 SWAY = 0.35  # m, how far the person walks to and fro
-SHIFTS = [("fanuc-sim", 8, 3, 75_000), ("fanuc-sim", 4, 3, 150_000), ("fanuc-sim", 2, 3, 300_000)]  # 600 s each
+SHIFTS = [
+    ("fanuc-sim-truth", 8, 3, 75_000),
+    ("fanuc-sim-truth", 4, 3, 150_000),
+    ("fanuc-sim-truth", 2, 3, 300_000),
+]  # 600 s each
 SHIFT = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
@@ -115,16 +119,16 @@ def person(now_ns: int) -> HumanState:
 
 @pytest.fixture(scope="module", autouse=True)
 def _warm() -> None:
-    warm_up(System(load_cell("fanuc-sim").params))
+    warm_up(System(load_cell("fanuc-sim-truth").params))
 
 
 @pytest.mark.parametrize(
     ("name", "period_ms", "version", "cycles"),
     [
-        ("fanuc-sim", 8, 3, 2000),
-        ("fanuc-sim", 8, 1, 1500),
-        ("fanuc-sim", 4, 3, 2000),
-        ("fanuc-sim", 2, 2, 2500),
+        ("fanuc-sim-truth", 8, 3, 2000),
+        ("fanuc-sim-truth", 8, 1, 1500),
+        ("fanuc-sim-truth", 4, 3, 2000),
+        ("fanuc-sim-truth", 2, 2, 2500),
         ("crx-sim", 8, 3, 1500),
         ("crx-sim", 4, 3, 2000),
         *(pytest.param(*shift, marks=SHIFT) for shift in SHIFTS),
@@ -143,7 +147,7 @@ def test_thousands_of_cycles_without_an_offence(name: str, period_ms: int, versi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "first_stage"), [("fanuc-sim", 0.2), ("crx-sim", 0.1)])
+@pytest.mark.parametrize(("name", "first_stage"), [("fanuc-sim-truth", 0.2), ("crx-sim", 0.1)])
 def test_one_box_for_all_flange_speeds_costs_hardly_any_goals(name: str, first_stage: float) -> None:
     """Against limits of the first stage, which no scheme that follows the flange speed can exceed."""
     (box, box_speed), (best, _) = goals_a_minute(name, 0.0), goals_a_minute(name, first_stage)
@@ -175,7 +179,7 @@ def goals_a_minute(name: str, flange_speed: float, goals: int = 24) -> tuple[flo
 
 
 def test_the_profile_alone_does_not_fit_both_conventions_of_j3_and_the_driver_says_so_before_it_sends() -> None:
-    cell = Cell("fanuc-sim", 8, told=False)
+    cell = Cell("fanuc-sim-truth", 8, told=False)
     with pytest.raises(ProtocolError, match="J3 jerk"):
         cell.run(3000)
     cell.driver.close()

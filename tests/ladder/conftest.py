@@ -41,7 +41,7 @@ def climb(tmp_path_factory: pytest.TempPathFactory) -> Climb:
     """climb(number, settings, mischief, cell): a step in lockstep, as it comes."""
 
     def run(
-        number: int, settings: Sequence[str] = (), mischief: Mischief | None = None, name: str = "fanuc-sim"
+        number: int, settings: Sequence[str] = (), mischief: Mischief | None = None, name: str = "fanuc-sim-truth"
     ) -> Run:
         log = tmp_path_factory.mktemp("step") / "log.mcap"
         return Rig(short(number), log, [NEAR_GOALS, *settings], name, mischief).climb()
@@ -66,9 +66,9 @@ def real(tmp_path: Path) -> Path:
     place = pose_value(pose(LOOKING, np.array([2.0, 0.0, 0.6])))
     about = {"serials": {"camera": "c1"}, "mode": "640x480"}
     Result("hand-eye", "T_base_cam", place, rows(np.eye(6) * 1e-8), "test", **about).save(tmp_path / "eye.json")
-    text = (CELLS / "fanuc-sim.toml").read_text()
+    text = (CELLS / "fanuc-sim-truth.toml").read_text()
     for old, new in {
-        'name = "fanuc-sim"': 'name = "mine"',
+        'name = "fanuc-sim-truth"': 'name = "mine"',
         "simulated = true ": f'certificates = "{CELLS / "certificates"}"\nsimulated = false ',
         'host = "127.0.0.1"': 'host = "192.168.1.10"',
         'calibration = "ground-truth"': 'camera = "c1"\ncamera_mode = "640x480"\ncalibration = "eye.json"',

@@ -50,7 +50,7 @@ class Rig:
         step: Step,
         log: Path,
         settings: Sequence[str] = (),
-        name: str = "fanuc-sim",
+        name: str = "fanuc-sim-truth",
         mischief: Mischief | None = None,
     ) -> None:
         self.step, self.mischief = step, mischief or (lambda rig: None)

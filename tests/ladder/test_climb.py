@@ -62,7 +62,7 @@ def session(monkeypatch: pytest.MonkeyPatch, passed: Callable[[int], Run]) -> di
     return told
 
 
-def ladder(folder: Path, mode: str = SIM, cell: str = "fanuc-sim", *overrides: str) -> Ladder:
+def ladder(folder: Path, mode: str = SIM, cell: str = "fanuc-sim-truth", *overrides: str) -> Ladder:
     return Ladder.of(cell, list(overrides), mode, Journal(folder, KEY))
 
 
@@ -71,7 +71,7 @@ def test_a_step_that_passes_is_written_down_with_all_that_it_rests_on(tmp_path: 
     step = it.steps[0]
     entry = it.climb(step, person)
     assert (entry["verdict"], entry["failed"]) == (PASS, [])
-    assert entry["cell_hash"] == cell_hash(load_cell("fanuc-sim")) and entry["step_sha256"] == step.digest
+    assert entry["cell_hash"] == cell_hash(load_cell("fanuc-sim-truth")) and entry["step_sha256"] == step.digest
     assert (tmp_path / entry["log"]).is_file() and len(entry["log_sha256"]) == 64
     assert entry["measures"]["cycles"] > 0
     assert person.asked == [*step.confirm, *step.asks]
@@ -214,7 +214,7 @@ def test_a_real_cell_without_simulated_devices_cannot_be_rehearsed(real: Path, t
     ("arguments", "says"),
     [
         (["no-such-cell", "--sim"], "no-such-cell"),
-        (["fanuc-sim"], "run it with --sim"),
+        (["fanuc-sim-truth"], "run it with --sim"),
         (["--sim", "--step", "3"], "step 3 hold: step 2 listen comes first (sim): it was not run yet"),
         (["--sim", "--step", "11"], "a step from 1 to 10"),
         (["--sim", "--step", "4-2"], "a step from 1 to 10"),

@@ -9,7 +9,7 @@ from asc_rt.config import CELLS, load_cell
 from asc_rt.ladder import identity
 from asc_rt.ladder.identity import cell_hash
 
-WAS = cell_hash(load_cell("fanuc-sim"))
+WAS = cell_hash(load_cell("fanuc-sim-truth"))
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ WAS = cell_hash(load_cell("fanuc-sim"))
     ],
 )
 def test_where_things_are_and_what_is_simulated_does_not_count(change: str) -> None:
-    assert cell_hash(load_cell("fanuc-sim", [change])) == WAS
+    assert cell_hash(load_cell("fanuc-sim-truth", [change])) == WAS
 
 
 @pytest.mark.parametrize(
@@ -46,13 +46,13 @@ def test_where_things_are_and_what_is_simulated_does_not_count(change: str) -> N
     ],
 )
 def test_what_decides_how_the_arm_moves_counts(change: str) -> None:
-    assert cell_hash(load_cell("fanuc-sim", [change])) != WAS
+    assert cell_hash(load_cell("fanuc-sim-truth", [change])) != WAS
 
 
 def test_comments_and_order_do_not_count_certificates_do(tmp_path: Path) -> None:
     shutil.copytree(CELLS / "certificates", tmp_path / "certificates")
     cell = tmp_path / "mine.toml"
-    cell.write_text("# mine\n" + (CELLS / "fanuc-sim.toml").read_text())
+    cell.write_text("# mine\n" + (CELLS / "fanuc-sim-truth.toml").read_text())
     assert cell_hash(load_cell(cell)) == WAS
     other = tmp_path / "certificates" / "lrmate_200id-bat.json"
     other.unlink()
@@ -68,7 +68,7 @@ def test_our_code_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     )
     monkeypatch.setattr(identity, "PACKAGE", tmp_path / "asc_rt")
     monkeypatch.setattr(identity, "CODE", (tmp_path / "asc_rt",))
-    cell = load_cell("fanuc-sim")
+    cell = load_cell("fanuc-sim-truth")
     before = cell_hash(cell)
     gate = tmp_path / "asc_rt" / "core" / "gate.py"
     gate.write_text(gate.read_text() + "\n")

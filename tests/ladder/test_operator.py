@@ -18,7 +18,7 @@ STEPS = {step.name: step for step in load_steps()}
 class Desk:
     """A step's operator and what it says; `hear` lets a tenth of a second pass."""
 
-    def __init__(self, name: str, cell: str = "fanuc-sim", real: bool = True) -> None:
+    def __init__(self, name: str, cell: str = "fanuc-sim-truth", real: bool = True) -> None:
         self.events, self.goals, self.faults, self.told = Box(), Box(), Box(), []
         self.now = 0.0
         faults = None if real else self.faults
@@ -93,7 +93,7 @@ def test_a_person_changes_the_tools_of_a_real_cell_one_after_the_other() -> None
 
 
 def test_each_joint_swings_towards_the_middle_of_its_range_and_back() -> None:
-    params: Any = load_cell("fanuc-sim").params
+    params: Any = load_cell("fanuc-sim-truth").params
     q = [*params.robot.q_max[:3], *params.robot.q_min[3:]]
     poses = swings(q, 0.1, params)
     assert len(poses) == 12 and poses[1::2] == [q] * 6

@@ -59,7 +59,7 @@ def pretend(folder: Path, cell: str, overrides: Sequence[str], below: int) -> No
         )
 
 
-@pytest.mark.parametrize("cell", ["fanuc-sim", "fanuc-tools", "openarm-sim"])
+@pytest.mark.parametrize("cell", ["fanuc-sim-truth", "fanuc-tools", "openarm-sim"])
 def test_the_whole_ladder_in_simulation(cell: str, home: Path) -> None:
     code, told, err = climb(home, cell, "--sim", "--set", PATIENT)
     assert code == 0, err
@@ -93,7 +93,7 @@ CAN = {
     9: 'sim.can.faults=[{at_s = 4.0, fault = "safe_torque_off"}]',
     10: "sim.human.latency_ms=1500",
 }
-FAULTY = [("fanuc-sim", number, FANUC[number]) for number in FANUC]
+FAULTY = [("fanuc-sim-truth", number, FANUC[number]) for number in FANUC]
 FAULTY += [("openarm-sim", number, CAN[number]) for number in CAN]
 
 

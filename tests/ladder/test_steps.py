@@ -22,7 +22,7 @@ def test_the_ladder_goes_from_the_link_to_a_person_in_the_cell() -> None:
 
 
 @pytest.mark.parametrize("step", load_steps(), ids=lambda step: step.name)
-@pytest.mark.parametrize("cell", ["fanuc-sim", "openarm-sim"])
+@pytest.mark.parametrize("cell", ["fanuc-sim-truth", "openarm-sim"])
 def test_a_step_sets_a_simulated_cell_as_it_says(step, cell: str) -> None:
     load_cell(cell, [*step.sim, f"task.speed={step.task.speed:g}"])
 

@@ -117,7 +117,7 @@ def run_session(n: int, count: int, end: bool = True) -> list[Cycle]:
 
 @functools.cache
 def _cell() -> Cell:
-    return load_cell("fanuc-sim")
+    return load_cell("fanuc-sim-truth")
 
 
 @functools.cache

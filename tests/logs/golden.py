@@ -63,7 +63,7 @@ def distance_at(k: int) -> float:
 
 def make(path: Path) -> None:
     """Record the story with today's code."""
-    cell = load_cell("fanuc-sim")
+    cell = load_cell("fanuc-sim-truth")
     params = dataclasses.replace(
         cell.params, human=dataclasses.replace(cell.params.human, age_limit_ns=120_000_000)
     )  # so that silence stops the arm within the story

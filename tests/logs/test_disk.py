@@ -265,7 +265,7 @@ def test_the_policy_decides_whether_the_logger_stays(recording: Any, tmp_path: P
     ring.create(ring.wire_path(path), 600, 10)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [
-        sys.executable, "-m", "logs.writer", "--cell", "fanuc-sim", "--ring", str(path), "--out", str(out),
+        sys.executable, "-m", "logs.writer", "--cell", "fanuc-sim-truth", "--ring", str(path), "--out", str(out),
         "--set", f"bus.endpoint={endpoint}", "--set", f"log.on_full={policy}",
     ]  # fmt: skip
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}

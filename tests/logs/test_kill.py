@@ -43,7 +43,7 @@ class Session:
         (folder / "record").write_bytes(recording.packed(recording.cycles(5))[4])
         offsets = [str(layout.dtype.fields[path][1]) for path in ("inputs.tick", "inputs.t_ns")]
         environment = {**os.environ, "XDG_STATE_HOME": str(folder), "PYTHONPATH": str(ROOT)}
-        writer = ["-m", "logs.writer", "--cell", "fanuc-sim", "--ring", self.ring, "--out", self.out]
+        writer = ["-m", "logs.writer", "--cell", "fanuc-sim-truth", "--ring", self.ring, "--out", self.out]
         self.logger = self._start(*writer, "--set", f"bus.endpoint={endpoint}", env=environment)
         self._wait(self.out.exists)
         produce = Path(__file__).with_name("produce.py")

@@ -26,7 +26,7 @@ def test_everything_written_is_read_back(recording: Any) -> None:
     assert log.attachments[schema.CELL] == recording.cell.text.encode()
     assert log.attachments["lrmate_200id.urdf"] == recording.params.robot.urdf.encode()
     assert log.fingerprint["packages"]["numpy"] == np.__version__
-    assert log.session["cell"] == "fanuc-sim"
+    assert log.session["cell"] == "fanuc-sim-truth"
     assert log.end["messages /cell/cycle"] == "20"
     assert not log.truncated
     assert [(m.t_ns, m.data) for m in log.messages("/cell/goal")] == [(77, b'{"id": 1}')]

@@ -152,7 +152,7 @@ def test_the_joints_message_is_every_sample_of_the_cycles(recording: Any) -> Non
 
 
 def start(path: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "logs.writer", "--cell", "fanuc-sim", "--ring", str(path), "--out", str(out)]
+    command = [sys.executable, "-m", "logs.writer", "--cell", "fanuc-sim-truth", "--ring", str(path), "--out", str(out)]
     return subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
 
 

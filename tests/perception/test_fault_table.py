@@ -24,7 +24,7 @@ def session(rows: Rows) -> dict[str, dict[str, Any]]:
     robot, bus, left, right = free_port(kind=socket.SOCK_DGRAM), free_port(), free_port(), free_port()
     ports = (f"perception.camera.{name}.device.port={port}" for name, port in (("left", left), ("right", right)))
     settings = (f"driver.port={robot}", f"bus.endpoint=tcp/127.0.0.1:{bus}", *ports)
-    return {told["fault"]: told for told in seeing_faults.table("fanuc-sim-seeing", settings, [rows])}
+    return {told["fault"]: told for told in seeing_faults.table("fanuc-sim", settings, [rows])}
 
 
 def check(row: Row, rows: Rows) -> None:

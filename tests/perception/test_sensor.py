@@ -41,7 +41,7 @@ FAR_AWAY = np.radians([0.0, 0.0, 0.0, 0.0, -90.0, 0.0])
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    return System(load_cell("fanuc-sim").params)
+    return System(load_cell("fanuc-sim-truth").params)
 
 
 class Rig:
@@ -152,7 +152,7 @@ def test_where_people_may_come_upon_the_arm_unseen_nobody_is_not_told(system: Sy
     assert around(1.0) == pytest.approx(1.0 + 2.0 * ENTRY_S)
 
 
-@pytest.mark.parametrize("name", ["fanuc-sim-seeing"])
+@pytest.mark.parametrize("name", ["fanuc-sim"])
 def test_around_the_arm_at_its_goals_all_is_watched(name: str) -> None:
     cell = load_cell(name)
     assert cell.perception is not None

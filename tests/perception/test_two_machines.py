@@ -43,8 +43,8 @@ def machine() -> Iterator[str]:
 
 @pytest.fixture
 def cell(machine: str, tmp_path: Path) -> Path:
-    """fanuc-sim-seeing whose [perception] is on the other machine; its cameras listen on the link between the two."""
-    text = (CELLS / "fanuc-sim-seeing.toml").read_text()
+    """fanuc-sim whose [perception] is on the other machine; its cameras listen on the link between the two."""
+    text = (CELLS / "fanuc-sim.toml").read_text()
     bus, door, left, right = (free_port(HERE) for _ in range(4))
     robot = free_port(kind=socket.SOCK_DGRAM)
     changes = {
@@ -53,7 +53,7 @@ def cell(machine: str, tmp_path: Path) -> Path:
         r"(?m)^\[perception\]": "[perception]\nremote = true",
         r"port = 60115": f'host = "{HERE}", port = {left}',
         r"port = 60116": f'host = "{HERE}", port = {right}',
-        r"(fanuc-sim-seeing/\w+\.)": rf"{CELLS}/\1",
+        r"(fanuc-sim/\w+\.)": rf"{CELLS}/\1",
         r"age_limit_ms = 200": "age_limit_ms = 900",  # three processes with cameras on the cores of a test machine
     }
     for old, new in changes.items():

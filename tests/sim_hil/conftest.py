@@ -11,4 +11,4 @@ from asc_rt.core.params import Params
 @pytest.fixture(scope="session")
 def arm_params() -> Callable[[str], Params]:
     """Parameters of the LR Mate 200iD with the named tool."""
-    return lambda tool: load_cell("fanuc-sim", [f"tool={tool}"]).params
+    return lambda tool: load_cell("fanuc-sim-truth", [f"tool={tool}"]).params

@@ -29,7 +29,7 @@ def port() -> int:
 
 @pytest.fixture
 def cell(port: int, tmp_path: Path) -> Path:
-    text, changed = re.subn(r"(?m)^port = \d+", f"port = {port}", (CELLS / "fanuc-sim.toml").read_text())
+    text, changed = re.subn(r"(?m)^port = \d+", f"port = {port}", (CELLS / "fanuc-sim-truth.toml").read_text())
     assert changed == 1
     path = tmp_path / "cell.toml"
     path.write_text(text)

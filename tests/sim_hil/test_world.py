@@ -154,7 +154,7 @@ def test_the_process_publishes_until_it_is_told_to_stop(router: Bus, endpoint: s
 
 @pytest.mark.real_time
 def test_the_command_says_ready_and_ends_on_sigterm(router: Bus, endpoint: str) -> None:
-    command = [sys.executable, "-m", "sim_hil", "human", "fanuc-sim", "--set", f"bus.endpoint={endpoint}"]
+    command = [sys.executable, "-m", "sim_hil", "human", "fanuc-sim-truth", "--set", f"bus.endpoint={endpoint}"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -170,7 +170,7 @@ def test_the_command_says_ready_and_ends_on_sigterm(router: Bus, endpoint: str) 
 @pytest.mark.parametrize("bad", [["--set", "sim.human.sed=1"], ["--set", "safety.d_min_m=-1"], ["--sed", "1"]])
 def test_bad_input_is_one_line_and_exit_code_2(bad: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     try:
-        code = human.main("fanuc-sim", bad)
+        code = human.main("fanuc-sim-truth", bad)
     except SystemExit as exit:  # argparse
         code = exit.code if isinstance(exit.code, int) else -1
     assert code == 2
@@ -184,7 +184,7 @@ def test_without_a_bus_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
     monkeypatch.setattr(human, "open_client", nobody)
     monkeypatch.setattr("signal.signal", lambda *_: None)
-    assert human.main("fanuc-sim", []) == 1
+    assert human.main("fanuc-sim-truth", []) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 

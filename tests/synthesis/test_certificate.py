@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(300)
 
 @pytest.fixture(scope="module")
 def params() -> Params:
-    return load_cell("fanuc-sim").params
+    return load_cell("fanuc-sim-truth").params
 
 
 @pytest.fixture(scope="module")

@@ -69,12 +69,12 @@ def test_a_cell_gives_the_figures() -> None:
         "v_max": 2.0, "speed": None, "human_speed": 1.6, "torque_box": False, "human_acceleration": None,
         "links": "tool",
     }  # fmt: skip
-    request = command.make_request(None, "bat", None, "fanuc-sim", **given)
+    request = command.make_request(None, "bat", None, "fanuc-sim-truth", **given)
     assert (request.robot.name, request.tool.name, request.control) == ("lrmate_200id", "bat", "acceleration")
     assert (request.k, request.d_min, request.period) == (3.0, 0.1, 0.008)
     assert (request.ranges.d_low, request.ranges.d_high, request.ranges.speed_share) == (0.1, 1.0, 0.5)
-    assert command.make_request(None, None, None, "fanuc-sim", **{**given, "k": 7.0}).k == 7.0
-    assert command.make_request(None, None, None, "fanuc-sim", **{**given, "index": "phi-b"}).k is None
+    assert command.make_request(None, None, None, "fanuc-sim-truth", **{**given, "k": 7.0}).k == 7.0
+    assert command.make_request(None, None, None, "fanuc-sim-truth", **{**given, "index": "phi-b"}).k is None
 
 
 @pytest.mark.parametrize(
