@@ -11,16 +11,17 @@ import pytest
 from asc_rt.config import ConfigError, load_arm
 from asc_rt.core.params import STAND_IN
 from asc_rt.core.system import initial
+from asc_rt.core.types import CycleInputs, EventKind, JointState, Mode, RobotFlag, vector
 from logs.audit import audit
 from sim_hil import swap_picture
 from sim_hil.person import Person
 from sim_hil.plant import MujocoPlant
 from sim_hil.trials import file_trials, report, suites
 from sim_hil.trials.cell_systems import NOBODY_KNOWS, CellSystem
-from sim_hil.trials.sensing import Blind
+from sim_hil.trials.sensing import Ball, Blind, Perfect
 from sim_hil.trials.suite_files import FOLDER, load
 from sim_hil.trials.suites import Job
-from sim_hil.trials.swapping import Stands, Swaps, workplace
+from sim_hil.trials.swapping import Monitor, Stands, Swaps, workplace
 from sim_hil.trials.tasks import Shift
 
 SWAPPED = CellSystem("fanuc-tools", ("drill", "bat", "bare"))
@@ -102,8 +103,40 @@ def test_a_person_stands_still_near_goals_that_are_free_of_them() -> None:
     assert 2 <= len(place.goals) <= 4
     assert min(room[1:]) >= 0.2
     assert min(of_tool[1:]) <= 0.25
+    for seed in range(4):
+        near = workplace(np.random.default_rng(seed), [check], check, SWAPPED.goals, 0.3, 0.3, 0.2, 0.22)
+        assert min(distance(check, q, near.person) for q in near.goals) <= 0.22
     with pytest.raises(RuntimeError, match="none of 200 people"):
         workplace(np.random.default_rng(3), [plant_of("bat")], plant_of("bat"), SWAPPED.goals, 0.3, 9.0, 0.2, 0.25)
+
+
+def distance(plant: MujocoPlant, q: np.ndarray, person: Stands) -> float:
+    """Of the tool."""
+    plant.reset(q)
+    plant.set_person(person.at(0.0))
+    return plant.tool_distance()
+
+
+def test_a_classic_stop_keeps_its_distance_where_nobody_looking_does_not(tmp_path: Path) -> None:
+    name = short(tmp_path)
+    blind, stopped = (suites.run(Job(name, 1, policy, 1, 0)) for policy in ("none", "ssm-stop"))
+    assert blind.robot_caused > 0 and blind.tool_distance < 0.1
+    assert stopped.robot_caused == 0 and stopped.tool_distance > 0.3
+
+
+def test_the_operator_of_a_classic_stop_arms_far_from_people_and_stops_near_them() -> None:
+    system, n = file_trials._system(SWAPPED), 6
+    q = SWAPPED.goals[0]
+    at_work = dataclasses.replace(initial(system), mode=Mode.ACTIVE, dq_cmd=vector(np.full(n, 0.5)))
+    told: dict[float, list[EventKind]] = {}
+    for away in (3.0, 0.7):
+        monitor = Monitor(system, Perfect(Ball(np.array([away, 0.0, 0.3]), 0.1)))
+        told[away] = []
+        for state in (dataclasses.replace(initial(system), mode=Mode.HOLD), at_work):
+            joint = JointState(0, 0, 1, vector(q), state.dq_cmd, system.zero, RobotFlag.READY, 0, False)
+            x = CycleInputs(1, 8_000_000, 8_000_000, joint, None, 0, (), None, (), 0, False)
+            told[away] += [event.kind for event in monitor.events(state, x)]
+    assert told == {3.0: [EventKind.ARM], 0.7: [EventKind.STOP]}
 
 
 def test_a_swap_keeps_the_motion_and_changes_shape_and_weight() -> None:
