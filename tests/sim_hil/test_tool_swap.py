@@ -129,14 +129,14 @@ def test_the_operator_of_a_classic_stop_arms_far_from_people_and_stops_near_them
     q = SWAPPED.goals[0]
     at_work = dataclasses.replace(initial(system), mode=Mode.ACTIVE, dq_cmd=vector(np.full(n, 0.5)))
     told: dict[float, list[EventKind]] = {}
-    for away in (3.0, 0.7):
-        monitor = Monitor(system, Perfect(Ball(np.array([away, 0.0, 0.3]), 0.1)))
+    for away in (3.0, 0.5):
+        monitor = Monitor(system, Perfect(Ball(np.array([away, -away, 0.3]), 0.1)))
         told[away] = []
         for state in (dataclasses.replace(initial(system), mode=Mode.HOLD), at_work):
             joint = JointState(0, 0, 1, vector(q), state.dq_cmd, system.zero, RobotFlag.READY, 0, False)
             x = CycleInputs(1, 8_000_000, 8_000_000, joint, None, 0, (), None, (), 0, False)
             told[away] += [event.kind for event in monitor.events(state, x)]
-    assert told == {3.0: [EventKind.ARM], 0.7: [EventKind.STOP]}
+    assert told == {3.0: [EventKind.ARM], 0.5: [EventKind.STOP]}
 
 
 def test_a_swap_keeps_the_motion_and_changes_shape_and_weight() -> None:
