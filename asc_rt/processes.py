@@ -127,8 +127,9 @@ class Processes:
             process.popen.wait()
 
     def end_all_but_logger(self) -> None:
-        """The control process first, so that the robot rests before anything else goes."""
-        for name in sorted(self._running.keys() - {"logger"}, key=lambda name: name != "control"):
+        """The last started first: control, so that the robot rests before anything else goes; and nobody misses what
+        it listens to."""
+        for name in reversed([name for name in self._running if name != "logger"]):
             self.end(name)
 
     def end_logger(self) -> None:
