@@ -189,6 +189,9 @@ def test_what_each_policy_is_told() -> None:
     assert all(m.covered for m in setups["asc"].system.params.changer.mounts)
     assert isinstance(setups["none"].sensor, Blind) and isinstance(setups["ssm-stop"].sensor, Blind)
     assert setups["ssm-stop"].operator is not None and setups["asc"].operator is None
+    plant = MujocoPlant(SWAPPED.params().holding(0), SWAPPED.goals[0])
+    told = {policy: s.changer.number(0.0, plant) for policy, s in setups.items() if s.changer is not None}
+    assert told == {"asc": 1, "enclosing-sphere": NOBODY_KNOWS, "ssm-stop": 1, "none": 1}
     at = [s.world.at(0.0) for s in setups.values()]
     assert all(np.array_equal(at[0].p0, other.p0) for other in at[1:])  # the same draws
 
