@@ -29,7 +29,7 @@ def draw(suite: str, done: Iterable[tuple[Job, Outcome]], path: Path) -> Path:
                 _profile(panel, system.d_min - _table(profiles), policy)
         panel.axhline(0.0, color="black", linewidth=0.8)
         panel.set(title=system.name.partition("+")[2].replace("+", " then "), xlabel="t [s]", ylim=(-FARTHEST, 0.2))
-    panels[0].set_ylabel("phi0 = d_min - d of the tool [m]; above 0: too near")
+    panels[0].set_ylabel("phi0 of the tool [m], above 0: too near")
     panels[0].legend(fontsize="small", loc="lower right")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

@@ -17,7 +17,7 @@ Row = dict[str, Any]
 OURS, NO_FILTER = "asc", "none"
 COLUMNS = (
     "system", "policy", "covered", "trials", "violations", "robot_caused", "bound_95", "infeasible", "limits_exceeded",
-    "stops", "needed", "reached", "reachable", "min_distance_m", "extra_m",
+    "stops", "needed", "reached", "reachable", "min_distance_m", "tool_m", "extra_m",
     "M_min", "M_max", "M_dot_star", "k", "median_s", "goals_per_min",
 )  # fmt: skip
 
@@ -27,7 +27,9 @@ def rows(suite: str, done: Iterable[tuple[Job, Outcome]]) -> list[Row]:
 
     `needed`: the share of the trials in which the robot violates without the filter, of those also run without it.
     `paired`: other policies on the same draws as ours: robot-caused, and the medians of (other - ours).
-    `extra_m`: the least distance of the tool in a trial less d_min, the median of all trials.
+    `tool_m`: the least distance of the tool in a trial, the median of all trials.
+    `extra_m`: how much of it the policy adds: less the greater of d_min and what the tool keeps in the same draw
+    without the filter (goals that are farther away say nothing of who leads there); without such twins, less d_min.
     """
     outcomes: dict[tuple[int, str], dict[int, Outcome]] = {}
     for job, outcome in sorted(done, key=lambda pair: pair[0].trial):
@@ -38,6 +40,7 @@ def rows(suite: str, done: Iterable[tuple[Job, Outcome]]) -> list[Row]:
         for policy in find(suite).policies:
             if found := outcomes.get((i, policy)):
                 row = _row(suite, i, policy, list(found.values()))
+                row["extra_m"] = _extra(found, outcomes.get((i, NO_FILTER), {}), row["d_min_m"])
                 if find(suite).is_transfer:
                     row |= _coverage(suite, i)
                 if policy == OURS:
@@ -62,6 +65,12 @@ def _coverage(suite: str, i: int) -> Row:
 def _needed(ours: dict[int, Outcome], unfiltered: dict[int, Outcome]) -> float | None:
     twins = ours.keys() & unfiltered.keys()
     return sum(unfiltered[k].robot_caused > 0 for k in twins) / len(twins) if twins else None
+
+
+def _extra(found: dict[int, Outcome], unfiltered: dict[int, Outcome], d_min: float) -> float | None:
+    twins = found.keys() & unfiltered.keys()
+    needed = {k: max(d_min, unfiltered[k].tool_distance) if twins else d_min for k in twins or found}
+    return _number(float(np.median([found[k].tool_distance - least for k, least in needed.items()])))
 
 
 def _paired(ours: dict[int, Outcome], other: dict[int, Outcome]) -> Row | None:
@@ -170,7 +179,7 @@ def _row(suite: str, i: int, policy: str, outcomes: Sequence[Outcome]) -> Row:
         "reached": sum(o.reached for o in outcomes),
         "reachable": sum(o.reachable for o in outcomes),
         "min_distance_m": min(o.min_distance for o in outcomes),
-        "extra_m": _number(float(np.median([o.tool_distance for o in outcomes])) - system.d_min),
+        "tool_m": _number(float(np.median([o.tool_distance for o in outcomes]))),
         "M_min": _number(min(o.M_min for o in outcomes)),
         "M_max": _number(max(o.M_max for o in outcomes)),
         "M_dot_star": max(o.M_dot_star for o in outcomes),

@@ -37,7 +37,7 @@ class Seen(Table):
 class Rules(Table):
     """What is asked of `asc` beside this, always: no violation that the robot causes, no limit exceeded."""
 
-    extra_share: Annotated[float, number(0, 10)] | None = None  # of the sphere's median extra distance, at most
+    extra_share: Annotated[float, number(0, 10)] | None = None  # of the median distance that the sphere adds, at most
     more_goals: Annotated[bool, Field(strict=True)] = False  # than with the sphere, and each of them faster
     least_goals: Annotated[float, number(0, 1000)] = 0.0  # per trial, in the mean
 

@@ -18,6 +18,7 @@ from sim_hil.person import Person
 from sim_hil.plant import MujocoPlant
 from sim_hil.trials import file_trials, report, suites
 from sim_hil.trials.cell_systems import NOBODY_KNOWS, CellSystem
+from sim_hil.trials.judge import Outcome
 from sim_hil.trials.sensing import Ball, Blind, Perfect
 from sim_hil.trials.suite_files import FOLDER, load
 from sim_hil.trials.suites import Job
@@ -257,3 +258,24 @@ def test_the_verdict_asks_for_less_distance_and_more_and_faster_goals() -> None:
         assert len(report.shortfalls("tool-swap", bad)) == 1
     assert not report.holds("tool-swap", [ours | {"robot_caused": 1}, sphere])
     assert not report.holds("tool-swap", [ours | {"limits_exceeded": 1}, sphere])
+
+
+def test_extra_distance_is_what_the_policy_adds() -> None:
+    """To d_min where the work leads there, to where the work is otherwise."""
+    number = dict.fromkeys(("violations", "robot_caused", "infeasible", "stops", "filtered"), 0)
+    share = dict.fromkeys(("speed_share", "torque_share", "M_min", "M_max", "M_dot_star", "min_distance"), 0.5)
+    nothing: dict[str, tuple[str, ...]] = dict.fromkeys(("limits_exceeded", "tools", "notes"), ())
+    made = Outcome(6.0, 749, 1, True, end="ACTIVE NONE", tool_distance=0.2, distances=(), **number, **share, **nothing)
+    least = {"asc": (0.16, 0.17, 0.3), "enclosing-sphere": (0.3, 0.36, 0.5), "none": (0.02, 0.15, 0.3)}
+    done = [
+        (Job("tool-swap", 2, policy, k, 0), dataclasses.replace(made, tool_distance=d))
+        for policy, distances in least.items()
+        for k, d in enumerate(distances)
+    ]
+    table = {row["policy"]: row for row in report.rows("tool-swap", done)}
+    assert {policy: row["extra_m"] for policy, row in table.items()} == pytest.approx(
+        {"asc": 0.02, "enclosing-sphere": 0.2, "none": 0.0}
+    )
+    assert table["asc"]["tool_m"] == 0.17
+    alone = [pair for pair in done if pair[0].policy == "asc"]
+    assert report.rows("tool-swap", alone)[0]["extra_m"] == pytest.approx(0.07)
