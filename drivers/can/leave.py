@@ -94,8 +94,10 @@ def _close_brakes(stream: Stream, targets: list[Target]) -> list[bool]:
     for axis in stream.axes:
         axis.brake_closed = None
     for _ in range(round(BRAKE_S * 1e9 / stream.period_ns)):
-        if not _open(stream, asked) or not cycle(stream, _wishing(targets, asked, Wish.BRAKE)):
+        if not _open(stream, asked):
             break
+        if not cycle(stream, _wishing(targets, asked, Wish.BRAKE)):
+            return braked
     still = _open(stream, asked)
     stream.found += [Found(Fault.BRAKE, i, stream.seq, "does not tell that it has closed") for i in still]
     return [brake and i not in still for i, brake in enumerate(braked)]

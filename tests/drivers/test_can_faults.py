@@ -239,7 +239,8 @@ def test_an_axis_whose_brake_does_not_tell_that_it_has_closed_keeps_its_power(
     rig = copy.deepcopy(enabled["panda"])
     run_up(rig, speed)
     rig.strike(jammed, SICK + 1, 0.0)
-    rig.driver._stream.axes[SICK].brake_closed = True  # what it told before it was asked to close is no answer
+    for axis in rig.driver._stream.axes:
+        axis.brake_closed = True  # what it told before it was asked to close is no answer
     rig.driver.stop()
     rest, drives = rig.line.mechanics.q.copy(), rig.line.drives
     rig.run(1_000_000_000)
@@ -261,6 +262,21 @@ def test_who_still_moves_at_the_end_of_the_stop_is_waited_for(
         begin = rig.now_ns()
         leave.come_to_rest(rig.driver._stream, rig.driver.dynamics)
         assert least <= (rig.now_ns() - begin) * 1e-9 <= most
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_axis_without_power_is_told_where_it_is_until_the_end(enabled: dict[str, Rig], arm: str) -> None:
+    """So that it does not jump when a person resets it: the way of the stop is another one."""
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, SPEED)
+    rig.strike("disable", SICK + 1)
+    rig.line.drives[SICK].jam_brake(closed=False, contact=False)
+    step(rig, wanted(), SPEED)
+    stream = rig.driver._stream
+    begin = stream.axes[SICK].feedback.q
+    leave.come_to_rest(stream, rig.driver.dynamics)
+    is_at = stream.axes[SICK].feedback.q
+    assert abs(is_at - begin) > 0.03 and stream.targets[SICK].q == pytest.approx(is_at, abs=0.02)
 
 
 def test_the_arm_stands_when_every_axis_does_that_has_no_fault() -> None:
