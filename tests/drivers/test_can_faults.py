@@ -23,6 +23,7 @@ from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, 
 from drivers.base import RobotFaulted
 from drivers.can import arms, leave
 from drivers.can.arm import Power
+from drivers.can.frame import Frame
 from drivers.can.reactions import RULES, Fault, Reaction
 from drivers.can.watch import AxisState
 
@@ -400,6 +401,46 @@ def test_an_arm_that_went_on_while_we_were_held_up_is_not_told_where_it_was(arm:
     np.testing.assert_allclose(sample.dq, m.dq, atol=0.03)
 
 
+@pytest.mark.parametrize("hour", [3600.0, -3600.0])
+def test_a_clock_that_is_set_while_the_arm_moves_changes_nothing(hour: float) -> None:
+    """That of the interface, by which the time between two answers is told; together with an answer that is lost. These
+    drives tell no speed: it is the difference of positions."""
+    rig = Rig("panda", stale_ms=50.0)
+    m, heard, ahead = rig.line.mechanics, rig.driver._link.receive, [0.0]
+    rig.driver.dynamics = lambda q, dq, ddq: vector(m.friction * dq + m.inertia * ddq)
+
+    def receive(deadline_ns: int) -> Frame | None:
+        frame = heard(deadline_ns)
+        return frame and dataclasses.replace(frame, stamp=frame.stamp + ahead[0])
+
+    rig.driver._link.receive = receive  # type: ignore[method-assign]
+    rig.driver.configure()
+    sample: JointState | None = rig.driver.activate(rig.period_ns)
+    for k in range(80):
+        assert sample is not None and RobotFlag.READY in sample.flags
+        ddq = 8.0 * (SPEED - sample.dq)
+        tau = rig.driver.dynamics(sample.q, sample.dq, ddq)
+        if k == 60:
+            rig.strike("lose", SICK + 1, 1)
+            ahead[0] = hour
+        sample = rig.cycle(torque(sample.q, sample.dq + rig.period_ns * 1e-9 * ddq, tau))
+        assert sample is not None
+        np.testing.assert_allclose(sample.dq, m.dq, atol=0.03)
+        np.testing.assert_allclose(sample.q, m.q, atol=3e-3)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_bus_on_which_nobody_answers_is_told_after_two_cycles(enabled: dict[str, Rig], arm: str) -> None:
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, 0.0)
+    rig.silence()
+    told = []
+    for _ in range(2):
+        assert step(rig, wanted(), 0.0) is None
+        told.append(rig.driver.report()["found"].get(Fault.SILENT, 0))
+    assert told == [0, 1]
+
+
 def test_an_interface_that_becomes_slow_shows_no_speed_that_is_not_there() -> None:
     """Some cycles pass without an answer, then each brings one that is as old: 4 ms lie in it, not the 16 ms between
     our cycles. These drives tell no speed: it is the difference of positions."""
@@ -421,6 +462,7 @@ def test_an_interface_that_becomes_slow_shows_no_speed_that_is_not_there() -> No
         if sample is not None:
             assert RobotFlag.READY in sample.flags
             np.testing.assert_allclose(sample.dq, m.dq, atol=0.25)
+    assert rig.driver.report()["late_answers"] > 0
 
 
 def deliver_late(rig: Rig, ns: int) -> None:
