@@ -23,7 +23,8 @@ LONGEST_REST_S = 2.0
 DEAF = 3  # cycles: who has not answered for so long is not asked any more
 BRAKE_S = 0.3  # 0.2 for a brake to move, the rest for its contact to be asked in turn
 SHUTDOWN_S = 1.0  # for brakes to close and power to go off
-SAG = 0.02  # rad that a braked axis may give way without power
+SAG = 0.02  # rad that a braked axis may give way without power, in the time that it is looked at
+SAG_S = 0.1
 
 
 def come_to_rest(stream: Stream, dynamics: Dynamics) -> None:
@@ -68,12 +69,15 @@ def leave(stream: Stream, dynamics: Dynamics) -> None:
     targets = hold(q, _weight(dynamics, q))
     braked = _close_brakes(stream, targets)
     stream.expects_power = [on and not brake for on, brake in zip(stream.expects_power, braked, strict=True)]
+    looks = round(SAG_S * 1e9 / stream.period_ns) if any(braked) else 0
     for _ in range(round(SHUTDOWN_S * 1e9 / stream.period_ns)):
-        if not any(_has_power(stream, i) for i, brake in enumerate(braked) if brake):
+        looks -= not any(_has_power(stream, i) for i, brake in enumerate(braked) if brake)
+        if looks < 0:
             break
         if not cycle(stream, _wishing(targets, braked, Wish.DISABLE)):
             return
-    sagged = [i for i, brake in enumerate(braked) if brake and abs(stream.pose()[0][i] - q[i]) > SAG]
+    down = stream.pose()[0] - q  # of who speaks: where a silent one is nobody knows
+    sagged = [i for i, brake in enumerate(braked) if brake and _speaks(stream, i) and abs(down[i]) > SAG]
     stream.found += [Found(Fault.BRAKE, i, stream.seq, "gives way without power") for i in sagged]
     stream.link.send(stream.codec.leave())
     heard_ns = stream.link.now_ns() + stream.period_ns
@@ -86,13 +90,14 @@ def _close_brakes(stream: Stream, targets: list[Target]) -> list[bool]:
     braked = [joint.has_brake for joint in stream.codec.joints]
     if not stream.codec.tells_brakes:
         return braked
-    speaks = [missed < DEAF for missed in stream.missed]
-    asked = [brake and _has_power(stream, i) and speaks[i] for i, brake in enumerate(braked)]
+    asked = [brake and _speaks(stream, i) for i, brake in enumerate(braked)]
     for axis in stream.axes:
         axis.brake_closed = None
     for _ in range(round(BRAKE_S * 1e9 / stream.period_ns)):
-        if not _open(stream, asked) or not cycle(stream, _wishing(targets, asked, Wish.BRAKE)):
+        if not _open(stream, asked):
             break
+        if not cycle(stream, _wishing(targets, asked, Wish.BRAKE)):
+            return braked
     still = _open(stream, asked)
     stream.found += [Found(Fault.BRAKE, i, stream.seq, "does not tell that it has closed") for i in still]
     return [brake and i not in still for i, brake in enumerate(braked)]
@@ -105,6 +110,10 @@ def _open(stream: Stream, asked: list[bool]) -> list[int]:
 
 def _wishing(targets: list[Target], which: list[bool], wish: Wish) -> list[Target]:
     return [replace(target, wish=wish) if these else target for target, these in zip(targets, which, strict=True)]
+
+
+def _speaks(stream: Stream, i: int) -> bool:
+    return stream.missed[i] < DEAF
 
 
 def _has_power(stream: Stream, i: int) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ruckig
 
-from asc_rt.core.limits import Bounds, acceleration_box, command_box, reserve
+from asc_rt.core.limits import Bounds, acceleration_box, braking, command_box, reserve
 from asc_rt.core.stopping import stopping_distance
 
 
@@ -164,6 +164,27 @@ def test_the_box_reaches_the_jerk_and_acceleration_limits_far_from_every_other(b
         np.testing.assert_allclose(lower, np.maximum(-b.ddq_max, ddq - T * b.dddq_max))
 
 
+def test_an_acceleration_beyond_its_limit_goes_back_as_fast_as_the_jerk_allows() -> None:
+    """A smaller limit came, with another tool: far from every wall nothing but the jerk says how fast."""
+    A, J, T = 8.0, 300.0, 0.008
+    b = Bounds(*(np.array([x]) for x in (-9.0, 9.0, 2.0, A, J)))
+    for ddq in (A + 2.0 * J * T, A + 1.5 * J * T):
+        assert command_box(b, np.zeros(1), np.zeros(1), np.array([ddq]), T)[1] == pytest.approx(ddq - J * T)
+        assert command_box(b, np.zeros(1), np.zeros(1), np.array([-ddq]), T)[0] == pytest.approx(J * T - ddq)
+
+
+def test_braking_is_full_and_in_the_end_no_faster_than_the_jerk_can_follow() -> None:
+    """-dq J / A inside the box: at 40 rad/s3 and 4 rad/s2 ten times the speed."""
+    cases = [  # dq, lower, upper, brake
+        (0.02, -4.0, 4.0, -0.2), (-0.02, -4.0, 4.0, 0.2), (3.0, -4.0, 4.0, -4.0), (-3.0, -4.0, 3.5, 3.5),
+        (0.3, -2.5, 4.0, -2.5), (0.0, -4.0, 4.0, 0.0), (1.0, 0.5, 2.0, 0.5), (-1.0, -3.0, -0.5, -0.5),
+    ]  # fmt: skip
+    dq, lower, upper, brake = (np.array(column) for column in zip(*cases, strict=True))
+    n = len(cases)
+    b = Bounds(*(np.full(n, x) for x in (-1.0, 1.0, 5.0, 4.0, 40.0)))
+    np.testing.assert_allclose(braking(b, dq, lower, upper), brake)
+
+
 def test_out_of_the_limits_the_box_leads_back(bench: Any) -> None:
     b, T = bench.system().bounds, 0.008
     for side in (1.0, -1.0):
@@ -237,6 +258,14 @@ def test_the_box_ends_where_a_stop_inside_the_limits_is_just_possible() -> None:
 @pytest.mark.parametrize("speed", [0.5, -0.5])
 def test_between_two_walls_the_one_that_is_approached_counts(speed: float) -> None:
     b, T = Bounds(*(np.array([x]) for x in (-0.01, 0.01, 2.0, 8.0, 300.0))), 0.008
+    lower, upper = command_box(b, np.zeros(1), np.array([speed]), np.zeros(1), T)
+    assert lower == upper == pytest.approx(-np.sign(speed) * 300.0 * T)
+
+
+@pytest.mark.parametrize(("wall", "speed"), [(0.0005, 0.01), (0.0005, -0.01), (0.0007, 0.01), (0.0007, -0.01)])
+def test_where_both_walls_call_for_braking_the_one_that_is_approached_counts(wall: float, speed: float) -> None:
+    """Nearer to each other than what is kept free before each: the other wall asks for the opposite."""
+    b, T = Bounds(*(np.array([x]) for x in (-wall, wall, 2.0, 8.0, 300.0))), 0.008
     lower, upper = command_box(b, np.zeros(1), np.array([speed]), np.zeros(1), T)
     assert lower == upper == pytest.approx(-np.sign(speed) * 300.0 * T)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from fractions import Fraction
 from typing import cast
 
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.base import ProtocolError
 from drivers.can import cia402
-from drivers.can.arm import Brake, Wish
+from drivers.can.arm import Brake, Emergency, Feedback, Power, Wish
 from drivers.can.arms import ARMS
 from drivers.can.cia402 import Control, Mode, Nmt, NodeState, PowerState, Scale, StatusFlag, Target
 from drivers.can.cia402_arm import Cia402Arm
@@ -121,6 +122,30 @@ def test_brakes_are_told_and_asked_in_turn_one_frame_a_cycle() -> None:
         assert {frame.data.hex() for frame in said[:7]} == {f"23fe6001{close:02x}000000"}
         assert {frame.data.hex() for frame in said[7:]} == {"40fd600000000000"}
     assert not [frame for frame in arm.encode(0, look(7), [None] * 7) if 0x600 <= frame.id < 0x680]
+
+
+@pytest.mark.parametrize(
+    ("state", "wish", "word"),
+    [
+        (PowerState.OPERATION_ENABLED, Wish.KEEP, 0x0F), (PowerState.OPERATION_ENABLED, Wish.BRAKE, 0x0F),
+        (PowerState.OPERATION_ENABLED, Wish.ENABLE, 0x0F), (PowerState.OPERATION_ENABLED, Wish.DISABLE, 0x06),
+        (PowerState.QUICK_STOP, Wish.KEEP, 0x02), (PowerState.QUICK_STOP, Wish.BRAKE, 0x02),
+        (PowerState.SWITCHED_ON, Wish.KEEP, 0x00), (PowerState.FAULT, Wish.KEEP, 0x00),
+        (PowerState.FAULT, Wish.ENABLE, 0x00), (PowerState.SWITCH_ON_DISABLED, Wish.ENABLE, 0x06),
+    ],
+)  # fmt: skip
+def test_a_drive_that_has_stopped_by_itself_is_left_holding_and_none_is_led_out_of_a_fault(
+    state: PowerState, wish: Wish, word: int
+) -> None:
+    arm = ARMS["panda"]
+    told = Feedback(Power.ENABLED, 0.0, None, 0.0, None, False, "", raw=state.value[1])
+    frames = arm.encode(1, hold([0.0] * 7, [0.0] * 7, wish), [told] * 7)
+    assert {frame.data[0] for frame in frames if 0x200 <= frame.id < 0x400} == {word}
+
+
+def test_an_emergency_message_that_tells_of_an_end_is_none() -> None:
+    heard = {code: ARMS["panda"].decode(Frame(0x83, struct.pack("<HB5x", code, 0))) for code in (0, 0x0010, 0x0100)}
+    assert heard == {0: (2, Emergency("")), 0x0010: (2, Emergency("")), 0x0100: (2, Emergency("EMCY 0100h"))}
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,9 +21,11 @@ from can_through import has_vcan
 
 from asc_rt.core.types import CommandKind, JointCommand, JointState, RobotFlag, Vector, vector
 from drivers.base import RobotFaulted
-from drivers.can import arms
+from drivers.can import arms, leave
 from drivers.can.arm import Power
+from drivers.can.frame import Frame
 from drivers.can.reactions import RULES, Fault, Reaction
+from drivers.can.watch import AxisState
 
 ARMS = ("openarm", "panda")
 INTERFACES = ("asc-sim", "virtual", "socketcan")
@@ -146,6 +150,7 @@ def test_a_fault_stops_the_arm_and_lets_nothing_fall(
     stopped, seen, way = strike_and_stop(rig, row, speed)
     assert seen <= row.cycles and stopped <= row.cycles + 1
     assert rig.driver.fault is not None and rig.driver.fault.hint
+    assert row.fault is Fault.BRAKE or not any(f.fault is Fault.BRAKE for f in rig.driver._stream.found)
     healthy = [i for i in range(len(rig.line.drives)) if i not in row.sick]
     dq, q = rig.line.mechanics.dq[healthy], way[:, healthy]
     assert np.all(np.abs(dq) < AT_REST), "the healthy axes are at rest"
@@ -235,6 +240,8 @@ def test_an_axis_whose_brake_does_not_tell_that_it_has_closed_keeps_its_power(
     rig = copy.deepcopy(enabled["panda"])
     run_up(rig, speed)
     rig.strike(jammed, SICK + 1, 0.0)
+    for axis in rig.driver._stream.axes:
+        axis.brake_closed = True  # what it told before it was asked to close is no answer
     rig.driver.stop()
     rest, drives = rig.line.mechanics.q.copy(), rig.line.drives
     rig.run(1_000_000_000)
@@ -243,6 +250,61 @@ def test_an_axis_whose_brake_does_not_tell_that_it_has_closed_keeps_its_power(
     assert all(drive.brake_closed for i, drive in enumerate(drives) if i != SICK)
     (found,) = rig.driver._stream.found
     assert (found.fault, found.axis) == (Fault.BRAKE, SICK) and "support the arm" in rig.driver.fault.hint
+
+
+def test_who_still_moves_at_the_end_of_the_stop_is_waited_for(
+    enabled: dict[str, Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Brakes that close on a moving arm wear; two seconds later they close all the same."""
+    for still, least, most in ((100, 0.27 + 0.4, 0.27 + 0.6), (10_000, 0.27 + 2.0, 0.27 + 2.2)):
+        rig, asked = copy.deepcopy(enabled["panda"]), []
+        run_up(rig, 0.0)
+        monkeypatch.setattr(leave, "_stands", lambda stream, a=asked, n=still: a.append(1) or len(a) > n)
+        begin = rig.now_ns()
+        leave.come_to_rest(rig.driver._stream, rig.driver.dynamics)
+        assert least <= (rig.now_ns() - begin) * 1e-9 <= most
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_axis_without_power_is_told_where_it_is_until_the_end(enabled: dict[str, Rig], arm: str) -> None:
+    """So that it does not jump when a person resets it: the way of the stop is another one."""
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, SPEED)
+    rig.strike("disable", SICK + 1)
+    rig.line.drives[SICK].jam_brake(closed=False, contact=False)
+    step(rig, wanted(), SPEED)
+    stream = rig.driver._stream
+    begin = stream.axes[SICK].feedback.q
+    leave.come_to_rest(stream, rig.driver.dynamics)
+    is_at = stream.axes[SICK].feedback.q
+    assert abs(is_at - begin) > 0.03 and stream.targets[SICK].q == pytest.approx(is_at, abs=0.02)
+
+
+def test_the_arm_stands_when_every_axis_does_that_has_no_fault() -> None:
+    def stands(*axes: AxisState) -> bool:
+        return leave._stands(cast(Any, SimpleNamespace(axes=axes)))
+
+    fallen = AxisState(dq=1.0, faults={Fault.AXIS_FAULT})
+    assert stands(AxisState(dq=0.049), AxisState(dq=-0.049), fallen)
+    for dq in (0.051, -0.051):
+        assert not stands(AxisState(), AxisState(dq=dq), fallen)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_an_axis_that_gives_way_once_its_power_is_off_is_told(enabled: dict[str, Rig], way: float) -> None:
+    """Its brake tells that it is closed, and slips: 20 mrad and more."""
+    rig = copy.deepcopy(enabled["panda"])
+    run_up(rig, 0.0)
+    rig.strike("brake", SICK + 1, 0.0)
+    rig.strike("contact", SICK + 1, 1.0)
+    rig.line.mechanics.load[SICK] = -way * 20.0
+    rig.driver.dynamics = lambda q, dq, ddq, m=rig.line.mechanics: vector(m.load)
+    for _ in range(50):
+        rig.driver.read(rig.now_ns())
+        step(rig, vector(rig.line.mechanics.q), 0.0)
+    rig.driver.stop()
+    (found,) = rig.driver._stream.found
+    assert (found.fault, found.axis, found.detail) == (Fault.BRAKE, SICK, "gives way without power")
 
 
 def test_brakes_are_closed_before_the_power_goes(enabled: dict[str, Rig]) -> None:
@@ -339,6 +401,46 @@ def test_an_arm_that_went_on_while_we_were_held_up_is_not_told_where_it_was(arm:
     np.testing.assert_allclose(sample.dq, m.dq, atol=0.03)
 
 
+@pytest.mark.parametrize("hour", [3600.0, -3600.0])
+def test_a_clock_that_is_set_while_the_arm_moves_changes_nothing(hour: float) -> None:
+    """That of the interface, by which the time between two answers is told; together with an answer that is lost. These
+    drives tell no speed: it is the difference of positions."""
+    rig = Rig("panda", stale_ms=50.0)
+    m, heard, ahead = rig.line.mechanics, rig.driver._link.receive, [0.0]
+    rig.driver.dynamics = lambda q, dq, ddq: vector(m.friction * dq + m.inertia * ddq)
+
+    def receive(deadline_ns: int) -> Frame | None:
+        frame = heard(deadline_ns)
+        return frame and dataclasses.replace(frame, stamp=frame.stamp + ahead[0])
+
+    rig.driver._link.receive = receive  # type: ignore[method-assign]
+    rig.driver.configure()
+    sample: JointState | None = rig.driver.activate(rig.period_ns)
+    for k in range(80):
+        assert sample is not None and RobotFlag.READY in sample.flags
+        ddq = 8.0 * (SPEED - sample.dq)
+        tau = rig.driver.dynamics(sample.q, sample.dq, ddq)
+        if k == 60:
+            rig.strike("lose", SICK + 1, 1)
+            ahead[0] = hour
+        sample = rig.cycle(torque(sample.q, sample.dq + rig.period_ns * 1e-9 * ddq, tau))
+        assert sample is not None
+        np.testing.assert_allclose(sample.dq, m.dq, atol=0.03)
+        np.testing.assert_allclose(sample.q, m.q, atol=3e-3)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_bus_on_which_nobody_answers_is_told_after_two_cycles(enabled: dict[str, Rig], arm: str) -> None:
+    rig = copy.deepcopy(enabled[arm])
+    wanted = run_up(rig, 0.0)
+    rig.silence()
+    told = []
+    for _ in range(2):
+        assert step(rig, wanted(), 0.0) is None
+        told.append(rig.driver.report()["found"].get(Fault.SILENT, 0))
+    assert told == [0, 1]
+
+
 def test_an_interface_that_becomes_slow_shows_no_speed_that_is_not_there() -> None:
     """Some cycles pass without an answer, then each brings one that is as old: 4 ms lie in it, not the 16 ms between
     our cycles. These drives tell no speed: it is the difference of positions."""
@@ -360,6 +462,7 @@ def test_an_interface_that_becomes_slow_shows_no_speed_that_is_not_there() -> No
         if sample is not None:
             assert RobotFlag.READY in sample.flags
             np.testing.assert_allclose(sample.dq, m.dq, atol=0.25)
+    assert rig.driver.report()["late_answers"] > 0
 
 
 def deliver_late(rig: Rig, ns: int) -> None:

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import math
 import struct
+from typing import cast
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asc_rt.core.types import CommandKind
 from drivers.base import ProtocolError
 from drivers.can import mit
+from drivers.can.arm import Target
+from drivers.can.arms import ARMS
 from drivers.can.mit import MOTORS, DriveStatus, MotorType, Register, SetPoint, Special
+from drivers.can.mit_arm import MitArm
 
 M4310 = MOTORS["DM4310"]
 motors = st.sampled_from(sorted(MOTORS)).map(MOTORS.__getitem__)
@@ -118,6 +124,22 @@ def test_any_bytes_give_an_answer_or_a_protocol_error(data: bytes) -> None:
 @pytest.mark.parametrize("status", [s for s in DriveStatus if s not in (DriveStatus.DISABLED, DriveStatus.ENABLED)])
 def test_every_trip_is_a_fault(status: DriveStatus) -> None:
     assert status.is_fault
+
+
+@pytest.mark.parametrize("axis", range(7))
+@pytest.mark.parametrize(("dq", "share"), [(0.0, 0.123), (0.3, -0.4567), (-0.8, 0.00321)])
+def test_a_torque_finer_than_its_code_is_right_on_the_mean(axis: int, dq: float, share: float) -> None:
+    """What a drive makes of the frames at the speed that was expected: tau + kd (v - dq)."""
+    arm = cast(MitArm, ARMS["openarm"])
+    motor = arm.axes[axis].type
+    tau = share * motor.torque
+    targets = [Target(CommandKind.TORQUE, 0.5, dq, tau if i == axis else 0.0) for i in range(7)]
+    made = []
+    for seq in range(400):
+        point = mit.decode(motor, arm.encode(seq, targets, [None] * 7)[axis].data)
+        made.append(point.tau + point.kd * (point.dq - dq))
+    assert point.kp == 0.0 and np.mean(made) == pytest.approx(tau, abs=motor.torque * 2e-5)
+    assert np.ptp(made) < 2.0 * motor.torque / 4095 / 5, "and far within a step of the torque's code"
 
 
 def test_registers() -> None:

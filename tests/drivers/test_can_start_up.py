@@ -23,6 +23,7 @@ from drivers.base import HandshakeError, LinkError
 from drivers.can import arms, cia402_arm, start_up
 from drivers.can.cia402_arm import Cia402Arm
 from drivers.can.driver import Can
+from drivers.can.stream import look
 from sim_hil.can import cia402_drive
 from sim_hil.can.line import FIRST_DRIVE
 
@@ -145,6 +146,18 @@ def test_what_goes_wrong_with_the_arm_refuses_the_start(wrong: str) -> None:
         assert not any(d.is_enabled for d in rig.line.drives), "nothing is enabled before all is known to be well"
 
 
+def test_an_answer_that_comes_late_is_not_lost() -> None:
+    """5 ms after its command, where the next one goes after 4: two of that axis in one cycle."""
+    rig = rig_of("openarm")
+    rig.driver.configure()
+    stream, told = rig.driver._new_stream(), []
+    for late in ({}, {SICK: 5_000_000}, {}, {}):
+        rig.line.late = late
+        start_up._cycle(stream, look(7))
+        told.append((stream.axes[SICK].lost, stream.counters.late_answers))
+    assert told == [(0, 0), (1, 0), (0, 1), (0, 1)]
+
+
 @pytest.mark.parametrize("arm", ["openarm", "panda"])
 def test_without_anything_wrong_it_starts(arm: str) -> None:
     rig = rig_of(arm)
@@ -195,6 +208,24 @@ def test_a_cell_that_goes_farther_than_the_drives_is_refused_with_the_figure(nam
             control._check(caps, System(dataclasses.replace(cell.params, robot=wide)))
         assert f"{math.degrees(q_min[SICK]):.4f} to {math.degrees(q_max[SICK]):.4f} deg" in str(refused.value)
         assert "position_deg" in refused.value.hint and "joint 3" not in str(refused.value)
+
+
+def test_what_is_set_in_a_drive_before_it_is_enabled() -> None:
+    """Spare PDOs off, because anybody who sends on them would command the axis; who watches whom, and for how long."""
+    rig = rig_of("panda", watchdog_ms=40.0)
+    rig.driver.configure()
+    rig.driver.activate(rig.period_ns)
+    for d in rig.line.drives:
+        od = cast(Any, d)._od
+        assert [od[index, 1] >> 31 for index in (0x1400, 0x1401, 0x1402, 0x1403)] == [0, 0, 0, 1]
+        assert [od[index, 1] >> 31 for index in (0x1800, 0x1801)] == [0, 1]
+        assert od[0x1016, 1] == 127 << 16 | 40 and od[0x1401, 5] == 40 and od[0x1017, 0] == 50
+        assert (od[0x605A, 0], od[0x6007, 0], od[0x60C2, 1], od[0x60C2, 2]) == (6, 3, 4, -3)
+        assert od[0x60FE, 1] == 0 and od[0x60FE, 2] == 1
+    rig = rig_of("openarm", watchdog_ms=40.0)
+    rig.driver.configure()
+    rig.driver.activate(rig.period_ns)
+    assert [cast(Any, d).settings.timeout for d in rig.line.drives] == [800] * 7
 
 
 def test_a_setting_that_a_drive_does_not_take_refuses_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
