@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from asc_rt.perception import kernels
 from asc_rt.perception.arm import EXTRAPOLATION_NS, Arm, JointHistory
-from asc_rt.perception.grid import Grid, View, without_specks
+from asc_rt.perception.grid import Grid, View, depth_sigma, without_specks
 from asc_rt.perception.parts import PARTS, Tracker, capsule
 from asc_rt.perception.volume import LEAST_INTRUSION, PERSON_VOLUME, REACH_SPEED, Volume
 from calibration.geometry import look_at
@@ -124,6 +124,27 @@ def test_the_nearest_side_is_told_from_the_whole_arm() -> None:
     assert grid.around(p0, p1, radius) == pytest.approx(0.3)
     assert grid.around(p0[:1], p1[:1], radius[:1]) == pytest.approx(0.9), "nobody comes in from above"
     assert grid.around(p0 + [0, 1, 0], p1 + [0, 1, 0], radius) == pytest.approx(-0.7)
+
+
+def test_a_voxel_is_free_if_all_of_it_lies_before_what_is_seen_noise_and_all() -> None:
+    volume = one_camera()
+    view, centres = volume.views[0], volume.grid.centres()
+    middle = (np.abs(centres[:, 1:]) < 0.15).all(1)
+    z = centres[view.free(with_board(1960)) & middle, 0]
+    assert len(z) and (z + volume.grid.size / 2 + 3.0 * depth_sigma(z) < 1.96).all()
+
+
+def test_a_voxel_is_free_if_nothing_narrow_stands_beside_its_middle() -> None:
+    """A bar of one column of pixels: no voxel whose picture touches that column is free."""
+    volume = one_camera()
+    view, (x, y, _) = volume.views[0], volume.grid.centres().T
+    column = LENS.cx - LENS.fx * y / x  # the camera looks along +x, right is -y
+    half = LENS.fx * volume.grid.size / 2 / x
+    for bar in range(30, 50):
+        depth = WALL.copy()
+        depth[:, bar] = 900
+        free = view.free(depth)
+        assert free.any() and not np.any(free & (np.abs(column - bar) < half + 0.5))
 
 
 def test_a_lone_missing_pixel_is_filled_with_the_nearest_and_two_are_not() -> None:
