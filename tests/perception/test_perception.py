@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from asc_rt.perception import kernels
 from asc_rt.perception.arm import EXTRAPOLATION_NS, Arm, JointHistory
-from asc_rt.perception.grid import Grid, View, without_specks
+from asc_rt.perception.grid import Grid, View, depth_sigma, without_specks
 from asc_rt.perception.parts import PARTS, Tracker, capsule
-from asc_rt.perception.volume import LEAST_INTRUSION, REACH_SPEED, Volume
+from asc_rt.perception.volume import LEAST_INTRUSION, PERSON_VOLUME, REACH_SPEED, Volume
 from calibration.geometry import look_at
 from drivers.cameras.base import Intrinsics
 from sim_hil import seeing, seeing_rods
@@ -53,15 +53,42 @@ def test_nobody_is_in_an_empty_volume_and_what_is_behind_a_surface_is_occupied()
 
 
 def test_what_was_hidden_stays_until_it_is_seen_free() -> None:
-    volume = one_camera()
+    volume = one_camera(half_width=1.2)
     volume.update(0, [WALL], NOWHERE)
     for k in range(1, 5):
         told = volume.update(k * STEP_NS, [with_board(2000)], NOWHERE)
-    blind = [volume.update(k * STEP_NS, [None], NOWHERE) for k in range(5, 7)]
-    grown = told[:, 0].min() - blind[-1][:, 0].min()
-    assert grown >= 2 * REACH_SPEED * STEP_NS * 1e-9 - 0.05, "blind, they may have come nearer at 2 m/s"
+    blind = [volume.update(k * STEP_NS, [None], NOWHERE) for k in range(5, 8)]
+    grown = front(told) - front(blind[-1])
+    assert grown >= 3 * REACH_SPEED * STEP_NS * 1e-9 - 0.05, "blind, they may have come nearer at 2 m/s"
     assert len(blind[1]) > len(blind[0]) > len(told)
-    assert not len(volume.update(7 * STEP_NS, [WALL], NOWHERE))
+    assert not len(volume.update(8 * STEP_NS, [WALL], NOWHERE))
+
+
+def front(told: np.ndarray) -> float:
+    """m, where the occupied begins in the middle of the picture, but for who came in at the near end."""
+    return float(told[(np.abs(told[:, 1:]) < 0.2).all(1) & (told[:, 0] > 1.5), 0].min())
+
+
+@pytest.mark.parametrize(("side", "fits"), [(6, False), (8, True)])
+def test_a_dark_pocket_is_somebody_if_a_person_fits_in(side: int, fits: bool) -> None:
+    volume = one_camera()
+    dark = np.zeros(volume.grid.shape, bool)
+    dark[12 : 12 + side, 8 : 8 + side, 4 : 4 + side] = True
+    volume.views[0].pixel[dark.ravel()] = -1
+    assert (side**3 * volume.grid.size**3 >= PERSON_VOLUME) == fits
+    for k in range(3):
+        assert len(volume.update(k * STEP_NS, [WALL], NOWHERE)) == (dark.sum() if fits else 0)
+
+
+def test_nobody_comes_out_of_a_pocket_that_nobody_fits_in() -> None:
+    """It grows dark around one that was found empty: the shadow of the robot has moved."""
+    volume, middle = one_camera(), np.array([16, 12, 8])
+    open_pixel = volume.views[0].pixel.copy()
+    for k, half in enumerate([3, 3, 4, 5]):
+        dark = np.zeros(volume.grid.shape, bool)
+        dark[tuple(slice(m - half, m + half) for m in middle)] = True
+        volume.views[0].pixel[:] = np.where(dark.ravel(), -1, open_pixel)
+        assert not len(volume.update(k * STEP_NS, [WALL], NOWHERE))
 
 
 def test_a_blind_camera_frees_nothing() -> None:
@@ -97,6 +124,27 @@ def test_the_nearest_side_is_told_from_the_whole_arm() -> None:
     assert grid.around(p0, p1, radius) == pytest.approx(0.3)
     assert grid.around(p0[:1], p1[:1], radius[:1]) == pytest.approx(0.9), "nobody comes in from above"
     assert grid.around(p0 + [0, 1, 0], p1 + [0, 1, 0], radius) == pytest.approx(-0.7)
+
+
+def test_a_voxel_is_free_if_all_of_it_lies_before_what_is_seen_noise_and_all() -> None:
+    volume = one_camera()
+    view, centres = volume.views[0], volume.grid.centres()
+    middle = (np.abs(centres[:, 1:]) < 0.15).all(1)
+    z = centres[view.free(with_board(1960)) & middle, 0]
+    assert len(z) and (z + volume.grid.size / 2 + 3.0 * depth_sigma(z) < 1.96).all()
+
+
+def test_a_voxel_is_free_if_nothing_narrow_stands_beside_its_middle() -> None:
+    """A bar of one column of pixels: no voxel whose picture touches that column is free."""
+    volume = one_camera()
+    view, (x, y, _) = volume.views[0], volume.grid.centres().T
+    column = LENS.cx - LENS.fx * y / x  # the camera looks along +x, right is -y
+    half = LENS.fx * volume.grid.size / 2 / x
+    for bar in range(30, 50):
+        depth = WALL.copy()
+        depth[:, bar] = 900
+        free = view.free(depth)
+        assert free.any() and not np.any(free & (np.abs(column - bar) < half + 0.5))
 
 
 def test_a_lone_missing_pixel_is_filled_with_the_nearest_and_two_are_not() -> None:
@@ -155,6 +203,23 @@ def test_a_steady_motion_is_known_within_its_bound_and_a_jump_begins_anew() -> N
     assert np.linalg.norm(jumped.velocity[0]) == 0.0
     assert jumped.velocity_bound[0] == pytest.approx(REACH_SPEED)
     assert not len(tracker.update(21 * STEP_NS, np.zeros((0, 3)), np.zeros(0)).radius)
+
+
+def test_nobody_is_told_to_be_faster_than_anybody_is() -> None:
+    tracker, rng = Tracker(1), np.random.default_rng(1)
+    cloud = rng.uniform(-0.1, 0.1, (200, 3))
+    for k in range(12):
+        parts = tracker.update(k * STEP_NS, cloud + [2.6 * k * STEP_NS * 1e-9, 0, 0], np.ones(200))
+        assert np.linalg.norm(parts.velocity[0]) <= REACH_SPEED + 1e-9
+    assert np.linalg.norm(parts.velocity[0]) > 1.9
+
+
+def test_who_is_near_the_robot_is_told_more_finely() -> None:
+    cloud = np.random.default_rng(1).uniform(-0.5, 0.5, (400, 3))
+    both, apart = np.concatenate([cloud, cloud + [4.0, 0, 0]]), np.repeat([0.1, 2.0], 400)
+    parts = Tracker(10).update(0, both, apart)
+    near = np.count_nonzero(np.maximum(parts.p0[:, 0], parts.p1[:, 0]) < 2.0)
+    assert near >= 7 and len(parts.radius) == 10
 
 
 # --- joints at the moment of capture ---------------------------------------------------------------------------------

@@ -209,6 +209,18 @@ def test_stamps_are_the_cells_with_how_far_they_may_be_off(rig: Rig) -> None:
     assert message.health == pb.HEALTH_OK, "joints are the cell's, too"
 
 
+def test_the_arm_is_where_it_was_by_its_own_clock_and_an_uncertain_stamp_is_told(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.warm()
+    asked: list[int] = []
+    monkeypatch.setattr(rig.sensor.joints, "at", lambda t_ns: asked.append(t_ns) or FAR_AWAY)
+    rig.eyes[0].offset_ns = 7_000_000
+    (message,) = rig.shoot(lambda: rig.frame(t_capture_sigma_ns=400_000), rig.frame)
+    assert asked == [message.t_capture_ns + 7_000_000]
+    assert message.t_capture_sigma_ns == 400_000
+
+
 def test_only_whole_batches_of_joints_are_heard(rig: Rig) -> None:
     bad = [b"{", b"[]", b'{"t_ns": [1]}', b'{"t_ns": [1], "q": [[0, 0]]}', b'{"t_ns": [1], "q": [[0,0,0,0,0,NaN]]}']
     hear(Box(*bad), rig.sensor, 6)  # type: ignore[arg-type]
