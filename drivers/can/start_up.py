@@ -174,7 +174,6 @@ def _seed(stream: Stream) -> Vector:
 def _enable_axis(stream: Stream, i: int, q: Vector, dynamics: Dynamics) -> Finding:
     """The axes before it hold, those after it stay as they are."""
     axis, tells = stream.axes[i], stream.codec.tells_brakes and stream.codec.joints[i].has_brake
-    axis.brake_closed = None
     for _ in range(ENABLE_CYCLES + (round(BRAKE_S * 1e9 / stream.period_ns) if tells else 0)):
         targets = hold(q, _weight(dynamics, q))
         targets[i] = hold(q, _weight(dynamics, q), Wish.ENABLE)[i]

@@ -174,7 +174,7 @@ def test_a_hot_drive_slows_the_arm_down_until_it_has_cooled(name: str) -> None:
     goal = Goal(1, vector(session.q0 + np.radians([60, 0, 0, 0, 0, 0, 0])))
     session.run(20)
     session.run(60, goal, arm=True)
-    slow = 1.05 * min(task.speed, task.slow_speed) * dq_max[0]
+    slow = 1.15 * min(task.speed, task.slow_speed) * dq_max[0]  # a reference without integral: to a tenth
 
     def speed() -> float:
         return float(session.rig.line.mechanics.dq[0])

@@ -95,6 +95,16 @@ def test_a_drive_that_is_still_hot_is_not_reset(arm: str) -> None:
     assert not wrong(lines)
 
 
+def test_a_cause_that_is_not_over_is_told() -> None:
+    rig = faulted("panda", "trip")
+    rig.line.drives[SICK].voltage = False
+    line = reset(rig, 3)["axis 3 reset"]
+    assert (line.ok, line.detail) == (False, "it is fault") and "cause is not over" in line.fix
+    rig.strike("power_on", SICK + 1)
+    rig.line.drives[SICK]._word = 0x80  # as somebody else left it: there has to be an edge
+    assert reset(rig, 3)["axis 3 reset"].detail == "it is switch on disabled"
+
+
 def test_the_figure_that_a_drive_has_to_be_cooler_than() -> None:
     rig = faulted("openarm", "hot", 111.0)
     for celsius, ok in ((81.0, False), (80.0, True)):
