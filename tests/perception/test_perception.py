@@ -253,8 +253,7 @@ def test_who_comes_in_is_told_before_they_are_near() -> None:
     """A seed whose person is still outside when the episode begins, 1.01 m from the arm, and 0.9 m 0.1 s later."""
     s = seeing.studio()
     for seed in (100_065, 100_073):
-        for look in seeing.episode(seed, 0.2):
-            assert look.told_later <= look.true_later
+        assert not any(map(seeing.is_over, seeing.episode(seed, 0.2)))
     least = seeing.NEAR + REACH_SPEED * seeing.HORIZON
     arm, radius = Arm(s.system.model), s.system.model.capsules.radius
     poses = [seeing.arm_at(seed, 2.0 * leg) for seed in range(40) for leg in range(4)]
@@ -264,6 +263,17 @@ def test_who_comes_in_is_told_before_they_are_near() -> None:
 def test_the_robot_at_work_is_nobody() -> None:
     looks = seeing.episode(5, 2.0, people=False)
     assert sum(look.told < seeing.NEAR for look in looks) == 0
+
+
+@pytest.mark.parametrize(
+    ("look", "over"),
+    [
+        ((0.5, 0.53, 0.5, 0.4), False), ((0.5, 0.55, 0.5, 0.4), True), ((0.5, 0.4, 0.5, 0.51), True),
+        ((1.1, math.inf, 0.9, math.inf), True), ((1.1, math.inf, 1.0, math.inf), False), ((0.1, 9.0, 0.1, 9.0), False),
+    ],
+)  # fmt: skip
+def test_over_is_who_is_near_and_told_farther_now_or_soon(look: tuple[float, ...], over: bool) -> None:
+    assert seeing.is_over(seeing.Look(*look, 0.04, 0.0)) == over
 
 
 def test_a_start_that_is_refused_is_no_stop_and_what_comes_later_is_one() -> None:
