@@ -155,15 +155,38 @@ def _quadratic(
     shared: bool,
 ) -> _Found:
     """The program in u / scale, with the share as one more variable if `shared`, and its answer."""
-    n, program = len(u_ref), _program(u_ref, C, floor, base, binding, U, scale, shared)
-    P, c, G, low, high, lower, upper = program
-    if len(low) == 1 and high[0] == np.inf:
-        x, solved = _of_one_row(P, c, G, low, lower, upper)
-        iterations = 0
-    else:
-        x, solved, iterations = _of_piqp(*program)
-    share = max(0.0, float(x[n]) - SOLVER_MARGIN) if shared else 1.0
-    return _Found(_boxed(x[:n] * scale, U), share, solved, iterations)  # a joint may have no width for rounding
+    u, share, solved, is_easy = _easily(u_ref, C, floor, base, binding, U, scale, shared)
+    if is_easy:
+        return _Found(u, share, solved, 0)
+    x, solved, iterations = _of_piqp(*_program(u_ref, C, floor, base, binding, U, scale, shared))
+    return _Found(*_meant(x, U, scale, shared), solved, iterations)
+
+
+@njit(cache=True)
+def _easily(
+    u_ref: Vector,
+    C: Matrix,
+    floor: Vector,
+    base: Vector,
+    binding: IntVector,
+    U: Matrix,
+    scale: Vector,
+    shared: bool,
+) -> tuple[Vector, float, bool, bool]:
+    """(u, share, solved, True) of a program with one row; else nothing, and False."""
+    P, c, G, low, high, lower, upper = _program(u_ref, C, floor, base, binding, U, scale, shared)
+    if low.shape[0] != 1 or high[0] != np.inf:
+        return u_ref, 0.0, False, False
+    x, solved = _of_one_row(P, c, G, low, lower, upper)
+    u, share = _meant(x, U, scale, shared)
+    return u, share, solved, True
+
+
+@njit(cache=True)
+def _meant(x: Vector, U: Matrix, scale: Vector, shared: bool) -> tuple[Vector, float]:
+    """(u, share). A joint without any room has none for rounding either."""
+    n = scale.shape[0]
+    return _boxed(x[:n] * scale, U), max(0.0, float(x[n]) - SOLVER_MARGIN) if shared else 1.0
 
 
 def _of_piqp(
