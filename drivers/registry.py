@@ -20,6 +20,7 @@ BUILTIN = {
 
 
 CAMERAS = {
+    "azure-mkv": "drivers.cameras.azure:AzureRecording",
     "depth-stream": "drivers.cameras.stream:DepthStream",
     "pcd": "drivers.cameras.pcd:PcdFiles",
     "realsense": "drivers.cameras.realsense:RealSense",
