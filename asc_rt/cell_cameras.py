@@ -46,6 +46,7 @@ class PerceptionOptions:
     voxel: float  # m
     margin: float  # m around the robot
     detection: float  # m
+    record: bool  # what the cameras see, too
     cameras: tuple[CameraOptions, ...]
 
     @property
@@ -72,6 +73,7 @@ def options(path: Path, cell: CellFile, faults: Faults) -> PerceptionOptions | N
         voxel=table.voxel_m,
         margin=table.margin_m,
         detection=table.detection_m,
+        record=table.record,
         cameras=tuple(camera for camera in cameras if camera is not None),
     )
 

@@ -21,22 +21,28 @@ Shots = Iterable[tuple[int, np.ndarray]]  # (stamp of the device ns, counts)
 
 
 def write_mcap(path: Path, shots: Shots, name: str = "left", lens: dict[str, Any] | None = None) -> str:
-    """A session as the logger writes it, with the pictures of one camera and its `lens`, if any."""
+    """A session with the pictures of one camera and its `lens`, if any."""
+    told = []
+    if lens is not None:
+        data = schema.CameraCalibration(frame_id=name, **lens).SerializeToString()
+        told.append((schema.camera_calibration(data), data))
+    for t_ns, counts in shots:
+        png = cv2.imencode(".png", counts)[1].tobytes() if counts.size else b""
+        image = schema.CompressedImage(frame_id=name, format="png", data=png)
+        image.timestamp.FromNanoseconds(t_ns)
+        told.append((schema.camera(data := image.SerializeToString()), data))
+    return write_log(path, told)
+
+
+def write_log(path: Path, told: Iterable[tuple[schema.Channel | None, bytes]]) -> str:
+    """A session as the logger writes it, with these messages."""
     cell = load_cell("fanuc-sim-truth")
     log = LogFile(path, attachments(cell), session(cell))
-    if lens is not None:
-        _put(log, schema.camera_calibration, schema.CameraCalibration(frame_id=name, **lens), 0)
-    for t_ns, counts in shots:
-        data = cv2.imencode(".png", counts)[1].tobytes() if counts.size else b""
-        _put(log, schema.camera, schema.CompressedImage(frame_id=name, format="png", data=data), t_ns)
+    for i, (channel, data) in enumerate(told):
+        assert channel is not None
+        log.message(channel, i, data)
     log.close({"reason": "session closed"})
     return str(path)
-
-
-def _put(log: LogFile, channel_of: Any, message: Any, t_ns: int) -> None:
-    message.timestamp.FromNanoseconds(t_ns)
-    data = message.SerializeToString()
-    log.message(channel_of(data), t_ns, data)
 
 
 def factory_calibration(lens: Sequence[float], serial: str = "S1", model: str = BROWN) -> bytes:
