@@ -87,6 +87,10 @@ def _check(path: Path, cell: CellFile, table: Perception, faults: Faults) -> Non
     if named != CAMERAS:
         key = f"human.calibrations.{table.sensor}" if table.sensor in human.calibrations else "human.calibration"
         faults.note(path, key, f"{named!r} is not what these cameras are calibrated by; {CAMERAS!r}")
+    for name, camera in sorted(table.camera.items()):
+        if camera.device.name in registry.FILES and not cell.simulated:
+            told = f"{camera.device.name!r} plays what was, who is here now is not in it; only in a simulated cell"
+            faults.note(path, f"perception.camera.{name}.device", told)
     for axis, low, high in zip("xyz", table.low, table.high, strict=True):
         if high - low < LEAST_SIDE_M:
             least = f"at least {LEAST_SIDE_M:g} m above low"

@@ -26,6 +26,7 @@ CAMERAS = {
     "realsense": "drivers.cameras.realsense:RealSense",
     "recording": "logs.camera:RecordedCamera",
 }
+FILES = frozenset({"azure-mkv", "pcd", "recording"})  # cameras that show the past under stamps of now
 
 
 def camera_class(name: str) -> type[DepthCamera]:
