@@ -46,6 +46,7 @@ class PerceptionOptions:
     voxel: float  # m
     margin: float  # m around the robot
     detection: float  # m
+    record: bool  # what the cameras see, too
     cameras: tuple[CameraOptions, ...]
 
     @property
@@ -72,6 +73,7 @@ def options(path: Path, cell: CellFile, faults: Faults) -> PerceptionOptions | N
         voxel=table.voxel_m,
         margin=table.margin_m,
         detection=table.detection_m,
+        record=table.record,
         cameras=tuple(camera for camera in cameras if camera is not None),
     )
 
@@ -85,6 +87,10 @@ def _check(path: Path, cell: CellFile, table: Perception, faults: Faults) -> Non
     if named != CAMERAS:
         key = f"human.calibrations.{table.sensor}" if table.sensor in human.calibrations else "human.calibration"
         faults.note(path, key, f"{named!r} is not what these cameras are calibrated by; {CAMERAS!r}")
+    for name, camera in sorted(table.camera.items()):
+        if camera.device.name in registry.FILES and not cell.simulated:
+            told = f"{camera.device.name!r} plays what was, who is here now is not in it; only in a simulated cell"
+            faults.note(path, f"perception.camera.{name}.device", told)
     for axis, low, high in zip("xyz", table.low, table.high, strict=True):
         if high - low < LEAST_SIDE_M:
             least = f"at least {LEAST_SIDE_M:g} m above low"

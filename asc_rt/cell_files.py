@@ -87,6 +87,7 @@ class Perception(Table):
     voxel_m: Annotated[float, number(0.02, 0.2)] = 0.05
     margin_m: Annotated[float, number(0.02, 0.2)] = 0.06  # around the robot nothing is told from it
     detection_m: Annotated[float, number(0.01, 0.5)] = 0.07  # width of what is surely seen; for who reads the log
+    record: Annotated[bool, Field(strict=True)] = False  # the depth images go into the session's recording, too
     camera: Annotated[dict[SensorName, Camera], Field(min_length=1, max_length=8)]
 
 

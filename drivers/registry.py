@@ -20,11 +20,13 @@ BUILTIN = {
 
 
 CAMERAS = {
+    "azure-mkv": "drivers.cameras.azure:AzureRecording",
     "depth-stream": "drivers.cameras.stream:DepthStream",
     "pcd": "drivers.cameras.pcd:PcdFiles",
     "realsense": "drivers.cameras.realsense:RealSense",
     "recording": "logs.camera:RecordedCamera",
 }
+FILES = frozenset({"azure-mkv", "pcd", "recording"})  # cameras that show the past under stamps of now
 
 
 def camera_class(name: str) -> type[DepthCamera]:

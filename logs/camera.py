@@ -1,93 +1,119 @@
-"""The camera channel of a recording, played as a depth camera: frames in their order, at their recorded distances.
+"""The camera channel of a recording, played as a depth camera.
 
 Lives here because only this package knows recordings; `drivers.registry` names it as the backend `recording`.
 """
 
 from __future__ import annotations
 
-import time
+import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
+from google.protobuf.message import DecodeError
 
-from drivers.base import HandshakeError, LinkError
-from drivers.cameras.base import CameraInfo, DepthFrame, Intrinsics, check_options, frozen
-from logs.recording import open_recording
-from logs.schema import CAMERAS, CompressedImage
+from drivers.base import HandshakeError, LinkError, ProtocolError
+from drivers.cameras.base import CameraInfo, Depth, DepthFrame, Intrinsics, check_options, frozen
+from drivers.cameras.replay import Replay, Shot
+from logs.reader import CorruptLog, ForeignFile, LogError
+from logs.recording import Recording, open_recording
+from logs.schema import CALIBRATION, CAMERAS, CameraCalibration, CompressedImage
+
+UNIT_M = 0.001  # ASSUMED: an image has no unit in it; the channel is for millimetres (logs/README.md)
+HEAD = 32  # frames from whose stamps the period is told
+LENSES = {"": 0, "plumb_bob": 5, "rational_polynomial": 8}  # Foxglove's names for lenses of OpenCV: length of D
+PINHOLE = ("fx", "fy", "cx", "cy")
 
 
 class RecordedCamera:
-    """Options: `file`, `camera` (its name in the recording), `fx`, `fy`, `cx`, `cy` px, `unit_m`, `speed` (1)."""
+    """Options: `file`, `camera` (its name in the recording); `fx`, `fy`, `cx`, `cy` px where the recording has no
+    calibration of it, or another lens counts; `unit_m` (0.001); `serial`, by which its calibration results name it
+    (`camera`)."""
 
     def __init__(self, options: dict[str, Any]) -> None:
         number = (int, float)
-        known: dict[str, Any] = {"file": str, "camera": str, **dict.fromkeys(("fx", "fy", "cx", "cy"), number)}
-        check_options("recording", options, known | {"unit_m": number, "speed": number})
-        if missing := known.keys() - options.keys():
-            raise ValueError(f"recording: {', '.join(sorted(missing))}: missing")
-        self._options = options
-        self._speed = float(options.get("speed", 1.0))
-        self._frames: Iterator[tuple[int, np.ndarray]] | None = None
-        self._next: tuple[int, np.ndarray] | None = None
+        known: dict[str, Any] = {"file": str, "camera": str, **dict.fromkeys(PINHOLE, number)}
+        check_options("recording", options, known | {"unit_m": number, "serial": str})
+        self._pinhole = {key: float(options[key]) for key in PINHOLE if key in options}
+        if missing := [key for key in known if key not in options and (self._pinhole or key not in PINHOLE)]:
+            raise ValueError(f"recording: {', '.join(missing)}: missing")
+        self._file, self._name = options["file"], options["camera"]
+        self._unit_m = float(options.get("unit_m", UNIT_M))
+        self._serial = options.get("serial", self._name)
+        self._replay: Replay | None = None
 
     def open(self) -> CameraInfo:
-        first = list(_head(self._images(), 2))
-        if len(first) < 2:
-            name = self._options["camera"]
-            raise HandshakeError(f"recording: fewer than two images of {name!r}", hint="see `asc view` for its cameras")
-        height, width = first[0][1].shape
-        fx, fy, cx, cy = (float(self._options[key]) for key in ("fx", "fy", "cx", "cy"))
-        lens = Intrinsics(width, height, fx, fy, cx, cy)
-        self._frames, self._next, self._seq = self._images(), None, 0
-        self._start_ns, self._first_ns = time.monotonic_ns(), first[0][0]
-        period_ns = round((first[1][0] - first[0][0]) / self._speed)
-        unit = float(self._options.get("unit_m", 0.001))
-        return CameraInfo("recording", self._options["camera"], "", lens, unit, period_ns, latency_ns=0)
+        self.close()
+        try:
+            recording = open_recording(self._file)
+            shots = self._shots(recording)
+            head = list(itertools.islice(shots, HEAD))
+            if len(head) < 2:
+                hint = "name another camera, or a recording of it: `asc view` shows what there is"
+                raise HandshakeError(f"{self._file}: fewer than two depth images of camera {self._name!r}", hint)
+            lens = self._lens(recording, head[0].depth)
+        except (CorruptLog, ForeignFile) as error:
+            raise HandshakeError(f"{error}", hint="name a recording of a session, undamaged") from error
+        except DecodeError as error:
+            raise HandshakeError(f"{self._file}: camera {self._name!r}: {error}", hint="record it again") from error
+        except LogError as error:
+            raise LinkError(f"{error}", hint="name an existing recording") from error
+        period_ns = round(float(np.median(np.diff([shot.t_device_ns for shot in head]))))
+        if period_ns <= 0:
+            raise HandshakeError(f"{self._file}: the stamps of camera {self._name!r} stand still", hint="record again")
+        self._replay = Replay(self._checked(itertools.chain(head, shots), head[0].depth.shape), period_ns)
+        return CameraInfo("recording", self._serial, "", lens, self._unit_m, period_ns, latency_ns=0)
 
     def read(self, deadline_ns: int) -> DepthFrame | None:
-        if self._frames is None:
+        if self._replay is None:
             raise LinkError("recording: not open", hint="open() comes before read()")
-        if (found := self._take(deadline_ns)) is None:
-            time.sleep(max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
-            return None
-        self._seq += 1
-        t_device_ns, image = found
-        due_ns = self._due_ns(t_device_ns)
-        return DepthFrame(frozen(image), due_ns, 0, round(t_device_ns / self._speed), time.monotonic_ns(), self._seq)
+        return self._replay.read(deadline_ns)
 
     def close(self) -> None:
-        self._frames = None
+        self._replay = None
 
-    def _take(self, deadline_ns: int) -> tuple[int, np.ndarray] | None:
-        """The next image, once it is due."""
-        assert self._frames is not None
-        self._next = self._next or next(self._frames, None)
-        if self._next is None or self._due_ns(self._next[0]) > deadline_ns:
-            return None
-        taken, self._next = self._next, None
-        time.sleep(max(self._due_ns(taken[0]) - time.monotonic_ns(), 0) * 1e-9)
-        return taken
-
-    def _due_ns(self, t_device_ns: int) -> int:
-        return self._start_ns + round((t_device_ns - self._first_ns) / self._speed)
-
-    def _images(self) -> Iterator[tuple[int, np.ndarray]]:
-        """(stamp of the device, counts) of each depth image."""
-        try:
-            recording = open_recording(self._options["file"])
-        except OSError as error:
-            raise LinkError(
-                f"{self._options['file']}: cannot be read: {error.strerror}", hint="name a recording"
-            ) from error
-        for message in recording.messages(CAMERAS + self._options["camera"]):
+    def _shots(self, recording: Recording) -> Iterator[Shot]:
+        """Colour images of the same name, and damaged ones, are passed over: a gap, as if they had been lost."""
+        for message in recording.messages(CAMERAS + self._name):
             image = CompressedImage.FromString(message.data)
-            counts = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_UNCHANGED)
-            if counts is not None and counts.dtype == np.uint16 and counts.ndim == 2:
-                yield image.timestamp.seconds * 1_000_000_000 + image.timestamp.nanos, counts
+            counts = _counts(image.data)
+            if counts is not None:
+                yield Shot(image.timestamp.ToNanoseconds(), counts)
+
+    def _checked(self, shots: Iterator[Shot], shape: tuple[int, ...]) -> Iterator[Shot]:
+        try:
+            for shot in shots:
+                if shot.depth.shape != shape:
+                    raise ProtocolError(f"{self._file}: camera {self._name!r} changes its size", hint="record one mode")
+                yield shot
+        except (LogError, DecodeError) as error:
+            raise ProtocolError(f"{self._file}: camera {self._name!r}: {error}", hint="record it again") from error
+
+    def _lens(self, recording: Recording, depth: Depth) -> Intrinsics:
+        height, width = depth.shape
+        if self._pinhole:
+            fx, fy, cx, cy = (self._pinhole[key] for key in PINHOLE)
+            return Intrinsics(width, height, fx, fy, cx, cy)
+        message = next(recording.messages(CAMERAS + self._name + CALIBRATION), None)
+        where, hint = f"{self._file}: camera {self._name!r}", "tell fx, fy, cx and cy"
+        if message is None:
+            raise HandshakeError(f"{where}: its lens is not recorded", hint)
+        told = CameraCalibration.FromString(message.data)
+        if (told.width, told.height) != (width, height):
+            raise HandshakeError(f"{where}: {width}x{height}; its lens is for {told.width}x{told.height}", hint)
+        known = LENSES.get(told.distortion_model) in (len(told.D), 0) and len(told.K) == 9
+        if not (known and all(map(math.isfinite, (*told.K, *told.D))) and min(told.K[0], told.K[4]) > 0.0):
+            raise HandshakeError(f"{where}: its lens ({told.distortion_model or 'no model'}) is not understood", hint)
+        return Intrinsics(width, height, told.K[0], told.K[4], told.K[2], told.K[5], tuple(told.D))
 
 
-def _head(frames: Iterator[tuple[int, np.ndarray]], count: int) -> Iterator[tuple[int, np.ndarray]]:
-    for _, frame in zip(range(count), frames, strict=False):
-        yield frame
+def _counts(data: bytes) -> Depth | None:
+    """Of a PNG of 16 bits; None: another image, or none."""
+    if not data:
+        return None  # OpenCV raises for it
+    counts = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
+        return None
+    return frozen(counts)

@@ -76,7 +76,8 @@ def test_degrees_stay_out_of_the_core() -> None:
         assert not words & {"radians", "degrees", "deg2rad", "rad2deg"}, name_of(path)
 
 
-CAMERA_CONTRACT = ("drivers.cameras.base", "drivers.cameras.watch")  # the same for every backend
+# The same for every backend; and how each of them plays a file.
+CAMERA_CONTRACT = ("drivers.cameras.base", "drivers.cameras.watch", "drivers.cameras.replay")
 
 # --- 2. drivers ------------------------------------------------------------------------------------------------------
 
@@ -115,6 +116,7 @@ def test_a_driver_knows_neither_bus_nor_log(module: str) -> None:
         ("mcap", ["logs/"]),
         ("rerun", ["logs/view"]),
         ("cv2", ["calibration/", "asc_rt/perception/", "drivers/cameras/", "logs/camera.py"]),
+        ("av", ["drivers/cameras/azure.py"]),
         ("can", ["drivers/can/", "sim_hil/"]),
         ("mujoco", ["sim_hil/"]),
         (

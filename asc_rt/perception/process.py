@@ -11,7 +11,7 @@ import os
 import queue
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any
 
@@ -26,6 +26,7 @@ from asc_rt.core.system import System
 from asc_rt.human_codec import clock_id
 from asc_rt.perception.background import BackgroundError
 from asc_rt.perception.cameras import CameraError, Frames, Opened, Reader, observer_of, open_all
+from asc_rt.perception.pictures import Pictures
 from asc_rt.perception.sensor import Identity, Sensor, around
 from asc_rt.remote import join
 from drivers.cameras.base import DepthFrame
@@ -33,6 +34,7 @@ from drivers.cameras.base import DepthFrame
 PRIORITY = 20  # SCHED_FIFO, below all that moves something
 READY_NS = 500_000_000
 WAIT_S = 0.01  # for the next frame
+Offer = Callable[[int, DepthFrame], None]  # number of the camera, frame
 TOGETHER = 0.4  # of a period, for which the frame of one camera waits for the others'
 
 
@@ -69,10 +71,22 @@ def run(cell: Cell, bus: Bus, clock: CellClock | None, stop: Sequence[int]) -> N
         frames: Frames = queue.SimpleQueue()
         for i, one in enumerate(opened):
             stack.callback(Reader(i, one, frames, _tell).close)
+        offer = _recorded(stack, opened, bus) if cell.perception.record else _unrecorded
         warm_up(sensor_of(cell, opened, clock), cell)
         sensor = sensor_of(cell, opened, clock)
-        realtime.set_up(PRIORITY, None)
-        _Loop(cell, bus, sensor, frames).run(stop)
+        realtime.set_up(PRIORITY, None)  # the threads above keep the priority of then
+        _Loop(cell, bus, sensor, frames, offer).run(stop)
+
+
+def _recorded(stack: ExitStack, opened: Sequence[Opened], bus: Bus) -> Offer:
+    puts = (bus.publisher(topic.key).put for topic in (topics.CAMERA, topics.CAMERA_CALIBRATION))
+    pictures = Pictures([(one.options.name, one.info) for one in opened], *puts)
+    stack.callback(pictures.close)
+    return pictures.offer
+
+
+def _unrecorded(number: int, frame: DepthFrame) -> None:
+    pass
 
 
 def sensor_of(cell: Cell, opened: Sequence[Opened], clock: CellClock | None = None) -> Sensor:
@@ -96,9 +110,9 @@ def warm_up(sensor: Sensor, cell: Cell) -> None:
 
 
 class _Loop:
-    def __init__(self, cell: Cell, bus: Bus, sensor: Sensor, frames: Frames) -> None:
+    def __init__(self, cell: Cell, bus: Bus, sensor: Sensor, frames: Frames, offer: Offer) -> None:
         assert cell.perception is not None
-        self._sensor, self._frames, self._n = sensor, frames, cell.params.n
+        self._sensor, self._frames, self._offer, self._n = sensor, frames, offer, cell.params.n
         self._people = bus.publisher(topics.human(cell.perception.sensor).key)
         self._ready = bus.publisher(topics.ready(topics.PERCEPTION).key)
         self._joints = bus.queue(topics.JOINTS.key)
@@ -122,13 +136,13 @@ class _Loop:
             self._say(now_ns)
 
     def _collect(self, waiting: dict[int, DepthFrame]) -> None:
-        """The newest frame of each camera."""
+        """The newest frame of each camera; all of them are offered to the recording."""
         with suppress(queue.Empty):
             number, frame = self._frames.get(timeout=WAIT_S)
-            waiting[number] = frame
             while True:
-                number, frame = self._frames.get_nowait()
                 waiting[number] = frame
+                self._offer(number, frame)
+                number, frame = self._frames.get_nowait()
 
     def _is_whole(self, waiting: dict[int, DepthFrame], now_ns: int) -> bool:
         """A frame of every camera in order, or one that has waited for long enough."""

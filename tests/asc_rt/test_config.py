@@ -18,6 +18,7 @@ from asc_rt import config
 from asc_rt.config import CELLS, ConfigError, load_cell, what_if
 from asc_rt.core.params import Params
 from calibration import result as calibration
+from drivers import registry
 
 
 def faults(cell: str | Path = "fanuc-sim-truth", *overrides: str) -> tuple[str, ...]:
@@ -285,6 +286,21 @@ def test_a_calibration_that_must_not_be_used_is_refused_with_the_cell(files: Pat
 )
 def test_what_is_wrong_with_the_cameras_is_one_line_with_its_key(change: str, key: str) -> None:
     assert [line for line in faults(SEEING, change) if f": {key}" in line]
+
+
+PLAYED = {"pcd": 'files = ["a.pcd"], fx = 1, fy = 1, cx = 1, cy = 1'} | dict.fromkeys(
+    ("recording", "azure-mkv"), 'file = "a"'
+)
+
+
+@pytest.mark.parametrize("name", sorted(PLAYED))
+def test_a_real_cell_sees_no_recordings(name: str) -> None:
+    camera = ', camera = "left"' if name == "recording" else ""
+    device = f'perception.camera.left.device={{name = "{name}", {PLAYED[name]}{camera}}}'
+    assert PLAYED.keys() == registry.FILES
+    said = [line for line in faults(SEEING, device, "simulated=false") if "plays what was" in line]
+    assert len(said) == 1 and "perception.camera.left.device" in said[0]
+    load_cell(SEEING, (device,))
 
 
 def test_cameras_without_a_perception_table_are_nobodys(files: Path) -> None:

@@ -13,17 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from camera_files import factory_calibration, write_mcap, write_mkv
 
 from drivers import registry
 from drivers.base import DriverError, HandshakeError, LinkError, ProtocolError
-from drivers.cameras import pcd
+from drivers.cameras import azure, pcd
 from drivers.cameras.base import CameraInfo, DepthCamera, DepthFrame, Intrinsics
 from drivers.cameras.clock import ForeignClock
 from drivers.cameras.stream import DepthStream
 from drivers.cameras.watch import CameraFault, Watch, moved
+from logs.camera import RecordedCamera
 from sim_hil.depth import Optics
 from sim_hil.depth_camera import StreamServer
 
@@ -79,22 +80,18 @@ def write_pcd(path: Path, counts: np.ndarray) -> str:
 
 
 def recording_rig(tmp_path: Path) -> Iterator[Rig]:
-    from logs import camera as module
-    from logs.camera import RecordedCamera
-    from logs.schema import CAMERAS, CompressedImage
+    lens = {"width": OPTICS.width, "height": OPTICS.height, "K": [11.0, 0, 7.5, 0, 11.0, 5.5, 0, 0, 1]}
+    file = write_mcap(tmp_path / "a.mcap", [(i * PERIOD_NS, picture(i)) for i in range(1, 4)], lens=lens)
+    yield Rig(RecordedCamera({"file": file, "camera": "left"}), lambda seed: None)
 
-    class Recording:
-        def messages(self, topic: str) -> Iterator[Any]:
-            assert topic == CAMERAS + "left"
-            for i in range(1, 4):
-                image = CompressedImage(data=cv2.imencode(".png", picture(i))[1].tobytes(), format="png")
-                image.timestamp.nanos = i * PERIOD_NS
-                yield type("M", (), {"data": image.SerializeToString()})
 
+def azure_rig(tmp_path: Path) -> Iterator[Rig]:
+    width, height = OPTICS.width, OPTICS.height
+    lens = factory_calibration((8.0 / width, 6.0 / width, 11.0 / width, 11.0 / width))
+    file = write_mkv(tmp_path / "a.mkv", [(i * PERIOD_NS, picture(i)) for i in range(1, 4)], lens)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "open_recording", lambda path: Recording())
-        options = {"file": "x.mcap", "camera": "left", "fx": 11.0, "fy": 11.0, "cx": 7.5, "cy": 5.5}
-        yield Rig(RecordedCamera(options), lambda seed: None)
+        patch.setitem(azure.MODES, "NFOV_UNBINNED", (width, (0, 0), (width, height)))
+        yield Rig(azure.AzureRecording({"file": file}), lambda seed: None)
 
 
 def realsense_rig(tmp_path: Path) -> Iterator[Rig]:
@@ -131,7 +128,13 @@ def realsense_rig(tmp_path: Path) -> Iterator[Rig]:
     camera.close()
 
 
-RIGS = {"depth-stream": stream_rig, "pcd": pcd_rig, "recording": recording_rig, "realsense": realsense_rig}
+RIGS = {
+    "azure-mkv": azure_rig,
+    "depth-stream": stream_rig,
+    "pcd": pcd_rig,
+    "realsense": realsense_rig,
+    "recording": recording_rig,
+}
 
 
 def test_every_registered_camera_is_tested() -> None:
@@ -301,6 +304,6 @@ def test_seeing_through_the_background_is_a_moved_camera_and_a_person_is_not() -
 
 @pytest.mark.parametrize("name", ["nonsense", "pcd2"])
 def test_an_unknown_camera_lists_the_known_ones(name: str) -> None:
-    with pytest.raises(ValueError, match=r"known: depth-stream, pcd, realsense, recording"):
+    with pytest.raises(ValueError, match=r"known: azure-mkv, depth-stream, pcd, realsense, recording"):
         registry.camera_class(name)
     assert issubclass(LinkError, DriverError)
