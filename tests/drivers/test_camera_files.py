@@ -85,15 +85,15 @@ def test_a_frame_that_is_not_due_waits_for_the_next_call() -> None:
 
 
 def test_a_recording_tells_lens_period_and_pictures(tmp_path: Path) -> None:
-    camera = recorded(tmp_path, shots(10, 76, 109, 142), unit_m=0.00025, serial="123")
+    camera = recorded(tmp_path, shots(10, 76, 109, 140, 173), unit_m=0.00025, serial="123")
     info = camera.open()
     lens = info.intrinsics
     assert (lens.mode, lens.fx, lens.fy, lens.cx, lens.cy, lens.distortion) == ("16x12", 11.0, 12.0, 7.5, 5.5, ())
     assert (info.unit_m, info.period_ns, info.serial) == (0.00025, 33 * MS, "123")
     frames, watch = played(camera), Watch(info)
     assert all(np.array_equal(frame.depth, picture(i)) for i, frame in enumerate(frames))
-    assert [frame.seq for frame in frames] == [1, 3, 4, 5]
-    assert [watch.look(frame) for frame in frames] == [CameraFault(0)] * 4
+    assert [frame.seq for frame in frames] == [1, 3, 4, 5, 6]
+    assert [watch.look(frame) for frame in frames] == [CameraFault(0)] * 5
     assert watch.lost == 1
 
 

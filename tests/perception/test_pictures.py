@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from asc_rt import topics
+from asc_rt.config import load_cell
+from asc_rt.perception import process
+from asc_rt.perception.cameras import Frames
 from asc_rt.perception.pictures import Pictures, image_message, lens_message
 from drivers.cameras.base import CameraInfo, Depth, DepthFrame, Intrinsics, frozen
 from logs import schema
@@ -82,6 +90,32 @@ def test_what_it_cannot_keep_up_with_is_left_out_and_nobody_waits() -> None:
     shown.close()
     times = [schema.CompressedImage.FromString(data).timestamp.ToNanoseconds() for data in images]
     assert [(t - times[0]) // MS for t in times] == [0, 98, 99], "the newest are there"
+
+
+def test_perception_offers_every_frame_that_came_and_says_them_where_the_logger_listens() -> None:
+    said: dict[str, list[bytes]] = {}
+
+    class Line:
+        def publisher(self, key: str) -> SimpleNamespace:
+            return SimpleNamespace(put=said.setdefault(key, []).append)
+
+        def queue(self, key: str) -> None:
+            pass
+
+    opened: Any = [SimpleNamespace(options=SimpleNamespace(name="left"), info=info())]
+    sensor: Any = SimpleNamespace(eyes=[SimpleNamespace(info=info())], fault=0)
+    bus: Any = Line()
+    frames: Frames = queue.SimpleQueue()
+    waiting: dict[int, DepthFrame] = {}
+    with ExitStack() as stack:
+        loop = process._Loop(load_cell("fanuc-sim"), bus, sensor, frames, process._recorded(stack, opened, bus))
+        for i in range(2):
+            frames.put((0, frame(i, T0_NS + i * MS)))
+        loop._collect(waiting)
+    assert waiting[0].seq == 1, "the newest"
+    images, lenses = said[topics.CAMERA.key], said[topics.CAMERA_CALIBRATION.key]
+    assert [channel.topic for data in images if (channel := schema.camera(data))] == ["/cell/camera/left"] * 2
+    assert [c.topic for data in lenses if (c := schema.camera_calibration(data))] == ["/cell/camera/left/calibration"]
 
 
 @pytest.mark.parametrize(("unit_m", "count", "mm"), [(0.001, 1234, 1234), (0.0001, 12346, 1235), (0.002, 40_000, 0)])
