@@ -176,7 +176,7 @@ def _easily(
     """(u, share, solved, True) of a program with one row; else nothing, and False."""
     P, c, G, low, high, lower, upper = _program(u_ref, C, floor, base, binding, U, scale, shared)
     if low.shape[0] != 1 or high[0] != np.inf:
-        return u_ref, 0.0, False, False
+        return np.empty(0), 0.0, False, False
     x, solved = _of_one_row(P, c, G, low, lower, upper)
     u, share = _meant(x, U, scale, shared)
     return u, share, solved, True

@@ -11,6 +11,7 @@ from asc_rt.core import changer
 from asc_rt.core.fusion import heard
 from asc_rt.core.kinematics import forward
 from asc_rt.core.rows import rows
+from asc_rt.core.safe_control import project, solve
 from asc_rt.core.step import step
 from asc_rt.core.system import System, initial
 from asc_rt.core.types import (
@@ -21,6 +22,7 @@ from asc_rt.core.types import (
     Health,
     HumanState,
     JointState,
+    Matrix,
     OperatorEvent,
     RobotFlag,
     vector,
@@ -40,8 +42,20 @@ def warm_up(system: System) -> None:
         held = system.holding(mount)
         state, x, joint = _run(held)
         going_on = dataclasses.replace(params, changer=dataclasses.replace(params.changer, goes_on=True))
-        changer.may_go_on(going_on, held, state, rows(held, state, x), np.inf)
+        found = rows(held, state, x)
+        changer.may_go_on(going_on, held, state, found, np.inf)
+        _solve(held, found.box)
         changer.torque_misfit(held, joint, np.ones(system.n))
+
+
+def _solve(system: System, box: Matrix) -> None:
+    """Two rows that can be kept, and two of which only a share can: what PIQP is asked, which people seldom bring on,
+    and the nearest control for a stop that asks for too much; with arrays of the kinds that rows and stops have."""
+    lower, width = box[0], box[1] - box[0]
+    C, base = np.eye(system.n)[:2], (lower + 0.2 * width)[:2]
+    for share in (0.5, 2.0):
+        solve(vector(lower), C, (lower + share * width)[:2], base, box, system.bounds.ddq_max)
+    project(lower + 2.0 * width, box, system.bounds.ddq_max)
 
 
 def _run(system: System) -> tuple[CoreState, CycleInputs, JointState]:

@@ -29,7 +29,7 @@ from asc_rt.perception.cameras import CameraError, Frames, Opened, Reader, obser
 from asc_rt.perception.pictures import Pictures
 from asc_rt.perception.sensor import Identity, Sensor, around
 from asc_rt.remote import join
-from drivers.cameras.base import DepthFrame
+from drivers.cameras.base import Depth, DepthFrame, frozen
 
 PRIORITY = 20  # SCHED_FIFO, below all that moves something
 READY_NS = 500_000_000
@@ -103,10 +103,19 @@ def sensor_of(cell: Cell, opened: Sequence[Opened], clock: CellClock | None = No
 
 
 def warm_up(sensor: Sensor, cell: Cell) -> None:
-    """Compiles and loads what the first picture would wait for. `sensor` has lived now."""
-    for t_ns in (0, 1):
-        sensor.observer.observe(t_ns, [eye.view.background for eye in sensor.eyes], np.zeros(cell.params.n))
-    sensor.observer.observe(2, [None] * len(sensor.eyes), np.zeros(cell.params.n))
+    """Compiles and loads what the first picture, and the first person, would wait for. `sensor` has lived now."""
+    q, empty = np.zeros(cell.params.n), [eye.view.background for eye in sensor.eyes]
+    pictures: list[list[Depth | None]] = [[*empty], [*empty], [_with_a_wall(d) for d in empty], [None] * len(empty)]
+    for t_ns, depths in enumerate(pictures):
+        sensor.observer.observe(t_ns, depths, q)
+
+
+def _with_a_wall(background: Depth) -> Depth:
+    """Something in the middle of the picture, half as far away as the room."""
+    depth = np.array(background)
+    h, w = depth.shape
+    depth[h // 4 : 3 * h // 4, w // 4 : 3 * w // 4] //= 2
+    return frozen(depth)
 
 
 class _Loop:
