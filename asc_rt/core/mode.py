@@ -58,7 +58,7 @@ def next_mode(
         return state
     people = judge(params.human, x)
     state = dataclasses.replace(state, slow=_caution(state, x, people.slow))
-    finding = _finding(params, state, x, people.stop, monitor)
+    finding = _finding(params, state, x, people.stop, d_measured, monitor)
     state = _hear(params, state, x, finding, d_measured, weighs_other)
     if finding.is_fault or (state.mode is Mode.ACTIVE and finding is not StopReason.NONE):
         state = stopping(state, finding)
@@ -126,7 +126,7 @@ def _hear(
 
 
 def _finding(
-    params: Params, state: CoreState, x: CycleInputs, people: StopReason, monitor: Monitor | None
+    params: Params, state: CoreState, x: CycleInputs, people: StopReason, d_measured: float, monitor: Monitor | None
 ) -> StopReason:
     """The worst reason not to move that this cycle's inputs show; `people`: what the ladder says of the sensors."""
     if x.joint is None:
@@ -143,6 +143,9 @@ def _finding(
     if (wrong := changer.finding(params, state, x.joint)) is not StopReason.NONE:
         return wrong
     if people is StopReason.NONE and params.monitor.is_enforced and not (monitor and monitor.is_kept):
+        return StopReason.SEPARATION
+    if people is StopReason.NONE and state.mode is Mode.ACTIVE and not d_measured >= 0.0:
+        # The bounds of arm and person overlap: contact cannot be excluded, and which way leads away is not known.
         return StopReason.SEPARATION
     return people
 

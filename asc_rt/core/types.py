@@ -196,7 +196,7 @@ class StopReason(IntEnum):
     INFEASIBLE = 13
     START_INSIDE = 14  # armed while a person was already too close
     LATE = 15
-    SEPARATION = 16  # nearer than the protective separation distance, where the cell enforces it
+    SEPARATION = 16  # contact cannot be excluded; or nearer than the protective distance, where the cell enforces it
     ROBOT_WARM = 17  # its drives ask for caution: a reason to go slowly only
     HUMAN_SCHEMA = 18  # a sensor speaks another version of the message
     HUMAN_CLOCK = 19  # a sensor stamps with another clock, or ahead of it

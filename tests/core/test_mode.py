@@ -302,3 +302,12 @@ def test_stopping_keeps_the_worst_reason_of_one_stop_and_forgets_older_stops(ben
     assert stopping(in_mode(bench, M.STOPPING, R.LATE), R.HUMAN_STALE).reason is R.LATE
     assert stopping(in_mode(bench, M.ACTIVE, R.NONE), R.HUMAN_STALE).reason is R.HUMAN_STALE
     assert stopping(in_mode(bench, M.STOPPING, R.HUMAN_STALE), R.LATE).reason is R.LATE
+
+
+@pytest.mark.parametrize(("d", "rests"), [(0.001, False), (0.0, False), (-0.001, True), (np.nan, True)])
+def test_where_contact_cannot_be_excluded_no_way_is_known_to_lead_away(bench: Any, d: float, rests: bool) -> None:
+    """MEASURED, 1 of 711 trials of the campaign: a bat that worked on 8 mm beside a forearm came closer at 17 mm/s."""
+    at_work = decide(bench, in_mode(bench, M.ACTIVE), d=d)
+    assert (at_work.mode, at_work.reason) == ((M.STOPPING, R.SEPARATION) if rests else (M.ACTIVE, R.NONE))
+    armed = decide(bench, in_mode(bench, M.HOLD), d=d, events=event(EventKind.ARM))
+    assert (armed.mode, armed.reason) == (M.HOLD, R.START_INSIDE)
