@@ -59,6 +59,19 @@ def possible(C: Any, floor: Any, lower: Any, upper: Any) -> float:
     return float(-best.fun)
 
 
+def nearest(u: Any, A: Any, b: Any, lower: Any, upper: Any) -> Any:
+    """What another solver finds, in shares of SCALE: the closest to u with A x >= b in the box."""
+    return minimize(
+        lambda x: float(np.sum((x - u / SCALE) ** 2)),
+        0.5 * (lower + upper) / SCALE,
+        jac=lambda x: 2.0 * (x - u / SCALE),
+        bounds=list(zip(lower / SCALE, upper / SCALE, strict=True)),
+        constraints={"type": "ineq", "fun": lambda x: A @ (x * SCALE) - b, "jac": lambda x: A * SCALE},
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 200},
+    )
+
+
 def test_the_control_is_the_closest_that_keeps_everything() -> None:
     solved = 0
     for u_ref, C, floor, lower, upper in problems(150):
@@ -70,19 +83,7 @@ def test_the_control_is_the_closest_that_keeps_everything() -> None:
         if not found.feasible:
             continue
         assert np.all(C @ found.u >= floor) and np.all((lower <= found.u) & (found.u <= upper))
-        other = minimize(
-            lambda x, r=u_ref: float(np.sum((x - r / SCALE) ** 2)),
-            0.5 * (lower + upper) / SCALE,
-            jac=lambda x, r=u_ref: 2.0 * (x - r / SCALE),
-            bounds=list(zip(lower / SCALE, upper / SCALE, strict=True)),
-            constraints={
-                "type": "ineq",
-                "fun": lambda x, C=C, f=floor: C @ (x * SCALE) - f,
-                "jac": lambda x, C=C: C * SCALE,
-            },
-            method="SLSQP",
-            options={"ftol": 1e-12, "maxiter": 200},
-        )
+        other = nearest(u_ref, C, floor, lower, upper)
         if not other.success:
             continue
         np.testing.assert_allclose(found.u / SCALE, other.x, atol=2e-4)
@@ -104,20 +105,7 @@ def test_torque_limits_are_kept_and_no_more_than_kept(rows: int) -> None:
         if not found.feasible:
             continue
         assert np.all(A @ found.u >= b) and np.all((lower <= found.u) & (found.u <= upper))
-        goal = 3.0 * u_ref / SCALE
-        other = minimize(
-            lambda x, r=goal: float(np.sum((x - r) ** 2)),
-            0.5 * (lower + upper) / SCALE,
-            jac=lambda x, r=goal: 2.0 * (x - r),
-            bounds=list(zip(lower / SCALE, upper / SCALE, strict=True)),
-            constraints={
-                "type": "ineq",
-                "fun": lambda x, A=A, b=b: A @ (x * SCALE) - b,
-                "jac": lambda x, A=A: A * SCALE,
-            },
-            method="SLSQP",
-            options={"ftol": 1e-12, "maxiter": 200},
-        )
+        other = nearest(3.0 * u_ref, A, b, lower, upper)
         if other.success and np.all(A @ (other.x * SCALE) >= b - 1e-9):
             np.testing.assert_allclose(found.u / SCALE, other.x, atol=2e-4)
             solved += 1
