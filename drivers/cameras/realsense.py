@@ -36,7 +36,9 @@ class RealSense:
         self._mode = tuple(options.get(key, default) for key, default in (("width", 640), ("height", 480)))
         self._rate = options.get("rate_hz", 30)
         self._latency_ns = round(options.get("latency_ms", 10.0) * 1e6)  # ASSUMED: readout and USB
-        self._device, self._sensor, self._queue = device, None, None
+        self._device = device
+        self._sensor: Any = None
+        self._queue: Any = None
         self._clock = ForeignClock(self._latency_ns)
 
     def open(self) -> CameraInfo:
