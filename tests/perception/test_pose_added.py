@@ -44,12 +44,12 @@ class Two:
             rig.sensor = Sensor(identity, rig.eyes, old.observer, lambda: "C", old._stamp)
         self.rig.sensor._limbs = lambda: self.limbs
 
-    def shoot(self, empty: bool = False) -> tuple[pb.HumanState, pb.HumanState]:
-        """One period of both; the message of each. Somebody holds a board, or nobody is there."""
+    def shoot(self, empty: bool = False, lost: bool = False) -> tuple[pb.HumanState, pb.HumanState]:
+        """One period of both; the message of each. Somebody holds a board, or nobody is there; `lost`: a camera is."""
         told = []
         for rig in (self.without, self.rig):
             make = rig.frame if empty else functools.partial(with_board, rig)
-            (message,) = rig.shoot(make, make)
+            (message,) = rig.shoot(make, None if lost else make)
             told.append(message)
         return told[0], told[1]
 
@@ -204,3 +204,14 @@ def test_of_a_camera_that_is_not_believed_no_limb_is(system: System) -> None:
     two.limbs = [two.at([(at, at)], camera=1)]
     without, told = two.shoot()
     assert is_told_as_without(without, told) == [] and told.health == pb.HEALTH_DEGRADED
+
+
+def test_limbs_mend_neither_health_nor_coverage(system: System) -> None:
+    two = Two(system).warm()
+    whole, _ = two.shoot()
+    for _ in range(8):
+        without, _ = two.shoot(lost=True)
+    assert without.health == pb.HEALTH_DEGRADED and without.coverage < whole.coverage
+    points = np.linspace([-2.3, 0.0, 0.0], [-1.5, 0.0, 0.0], 9)
+    two.limbs = [two.at([(point, point) for point in points], radius=0.3)]
+    assert is_told_as_without(*two.shoot(lost=True))

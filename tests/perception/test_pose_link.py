@@ -5,6 +5,7 @@ The real model is asked where a variable names its file:  ASC_POSE_MODEL=x.task 
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import os
@@ -20,13 +21,18 @@ import numpy as np
 import pytest
 
 from asc_rt.cell_cameras import PoseOptions
+from asc_rt.config import load_cell
+from asc_rt.core.system import System
 from asc_rt.perception.pose import BACKENDS, link, process
 from asc_rt.perception.pose.limbs import LIMBS, PEOPLE, Found, PoseError, Scene
 from asc_rt.perception.pose.link import Link
+from asc_rt.perception.volume import REACH_SPEED
 from drivers.cameras import pcd
-from drivers.cameras.base import DepthFrame
+from drivers.cameras.base import DepthFrame, frozen_image
 from tests.perception import test_five_people as five
+from tests.perception.test_pose_added import Two, is_told_as_without, with_board
 from tests.perception.test_pose_limbs import BOARD, IMAGE, a_scene, five_scene, needs_frame, with_boards
+from tests.perception.test_sensor import PERIOD_NS
 
 ROOT = Path(__file__).parents[2]
 MODEL = os.environ.get("ASC_POSE_MODEL", "")
@@ -69,9 +75,9 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     rigs = []
 
-    def make(name: str, cameras: int = 1, model: str = "model") -> Rig:
+    def make(name: str, scenes: dict[int, Scene] | None = None, model: str = "model") -> Rig:
         monkeypatch.setitem(BACKENDS, "scripted", f"tests.perception.scripted_pose:{name}")
-        rigs.append(Rig("scripted", {i: a_scene() for i in range(cameras)}, Path(model)))
+        rigs.append(Rig("scripted", scenes or {0: a_scene(), 1: a_scene()}, Path(model)))
         return rigs[-1]
 
     yield make
@@ -91,7 +97,7 @@ def test_limbs_come_with_the_stamp_of_their_own_capture_and_the_model_is_named(s
 
 
 def test_each_camera_has_its_turn_and_one_without_a_picture_is_not_asked(start: Callable[..., Rig]) -> None:
-    rig = start("Good", cameras=2)
+    rig = start("Good")
     rig.link.offer(0, shot(1, image=None))
     for k in range(2, 6):
         for camera in (0, 1, 0, 0):
@@ -193,6 +199,23 @@ def test_an_answer_in_order_is_one() -> None:
     assert link.found(0, 1, link._read(b'{"limbs": []}')).p0.shape == (0, 3)
     most = json.dumps({"limbs": [ROW] * (PEOPLE * len(LIMBS))}).encode()
     assert len(link.found(0, 1, link._read(most)).names) == PEOPLE * len(LIMBS) and len(most) < link.LONGEST_LINE
+
+
+# --- from the picture to the message ---------------------------------------------------------------------------------
+
+
+def test_what_is_seen_in_a_picture_is_told_beside_what_the_depth_layer_tells(start: Callable[..., Rig]) -> None:
+    two = Two(System(load_cell("fanuc-sim-truth").params)).warm()
+    rig = start("Good", scenes={1: link.scene(two.rig.eyes[1].view, 0.01)})
+    two.rig.sensor._limbs = rig.link.newest
+    frame = with_board(two.rig)
+    frame = dataclasses.replace(frame, image=frozen_image(np.zeros((*frame.depth.shape, 3))))
+    rig.ask(frame.t_capture_ns, camera=1, frame=frame)
+    extra = is_told_as_without(*two.shoot())
+    assert extra and {capsule.label for capsule in extra} <= {limb.name for limb in LIMBS}
+    grown = REACH_SPEED * PERIOD_NS * 1e-9
+    assert all(capsule.position_bound > 0.08 + grown for capsule in extra), "it is a period old"
+    assert is_told_as_without(*[two.shoot() for _ in range(4)][-1]) == [], "and then forgotten"
 
 
 # --- mediapipe -------------------------------------------------------------------------------------------------------
