@@ -227,6 +227,42 @@ def test_frames_are_as_the_contract_says(rig: Rig) -> None:
         camera.read(soon(0.0))
 
 
+# --- infrared alone --------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_is_the_left_imagers_and_depth_waits_a_little_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rigs = infrared_rig(tmp_path)
+    rig = next(rigs)
+    from drivers.cameras import realsense
+
+    class Late:
+        """Nothing is there at once."""
+
+        def __init__(self, queue: Any) -> None:
+            self.queue = queue
+
+        def poll_for_frame(self) -> None:
+            return None
+
+        def try_wait_for_frame(self, wait_ms: int) -> tuple[bool, Any]:
+            frame = self.queue.poll_for_frame() if wait_ms > 0 else None
+            return bool(frame), frame
+
+    camera: Any = rig.camera
+    camera.open()
+    streams = {(stream.stream_name(), stream.stream_index()) for stream in camera._sensor.get_active_streams()}
+    assert {index for name, index in streams if "Infrared" in name} == {1}
+    monkeypatch.setattr(realsense, "TOGETHER_MS", 60_000)  # so that a busy machine is no fault
+    camera._queue = Late(camera._queue)
+    for seed in (1, 2):
+        rig.show(seed)
+        frame = camera.read(soon(60.0))
+        assert frame is not None and frame.image is not None and np.array_equal(frame.image, infrared(seed))
+    rigs.close()
+
+
 # --- the stream alone ------------------------------------------------------------------------------------------------
 
 

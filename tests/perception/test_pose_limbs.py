@@ -112,7 +112,9 @@ def test_a_landmark_that_is_nowhere_or_on_the_background_is_none(wrist: tuple[fl
 
 def test_a_landmark_on_somebody_else_or_on_too_little_is_none() -> None:
     behind = (slice(10, 55), slice(51, 70), 3300)
-    assert told([("left elbow", 48.0, 30.0), ("left wrist", 55.0, 30.0)], with_boards(BOARD, behind)) == {}
+    estimator = Scripted([("left elbow", 55.0, 30.0), ("left wrist", 58.0, 30.0)])
+    rows = found(with_boards(BOARD, behind), IMAGE, a_scene(), estimator)
+    assert len(estimator.shown) == 2 and [name for name, *_ in rows] == ["left forearm"], "of the one behind alone"
     corner = [("left elbow", 46.0, 50.0), ("left wrist", 52.4, 55.4)]
     assert told(corner) == {}, "two pixels of the corner"
     assert told([corner[0], ("left wrist", 51.4, 54.4)]).keys() == {"left forearm"}
