@@ -10,16 +10,20 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from asc_rt import doctor
 from asc_rt.config import Cell, ConfigError, load_cell
 from asc_rt.ladder.identity import cell_hash
 from asc_rt.perception import process
+from asc_rt.perception.grid import Grid, View
 from asc_rt.perception.pose.limbs import PoseError
+from drivers.cameras.base import Intrinsics
 from logs import context
 
 CELL = "fanuc-sim"
+GRID = Grid.over(np.zeros(3), np.ones(3), 0.5)
 
 
 def with_pose(model: Path, backend: str = "mediapipe") -> Cell:
@@ -111,3 +115,38 @@ def test_perception_that_may_not_run_it_ends_with_a_line(
     monkeypatch.setattr(process.launch, "told_to_end", list)
     assert process.main([CELL]) == 2
     assert capsys.readouterr().err == "perception: people.task: no model; name another one\n"
+
+
+def test_frames_go_to_the_estimator_and_its_limbs_to_the_sensor(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing of it where it is not asked for."""
+    made: list[Any] = []
+    wired: dict[str, Any] = {}
+    view = View(Intrinsics(8, 6, 6.0, 6.0, 3.5, 2.5), 0.001, np.eye(4), np.full((6, 8), 3000, np.uint16), GRID)
+    eyes = [SimpleNamespace(view=view, info=SimpleNamespace(has_image=has)) for has in (False, True)]
+    opened: Any = [SimpleNamespace(camera=SimpleNamespace(close=lambda: None))] * 2
+
+    def link(options: Any, scenes: Any, tell: Any) -> Any:
+        made.append(
+            SimpleNamespace(offer=object(), newest=object(), scenes=scenes, close=lambda: wired.update(closed=1))
+        )
+        return made[-1]
+
+    def sensor(cell: Any, opened: Any, clock: Any, limbs: Any = tuple) -> Any:
+        wired["limbs"] = limbs
+        return SimpleNamespace(eyes=eyes, observer=SimpleNamespace(pose_bounds=(0.01, 0.02)))
+
+    def loop(cell: Any, bus: Any, sensor: Any, frames: Any, offers: Any) -> Any:
+        wired["offers"] = offers
+        return SimpleNamespace(run=lambda stop: None)
+
+    for name, stub in {"open_all": lambda *_: opened, "Link": link, "sensor_of": sensor, "_Loop": loop}.items():
+        monkeypatch.setattr(process, name, stub)
+    monkeypatch.setattr(process, "Reader", lambda *_: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(process, "warm_up", lambda *_: None)
+    monkeypatch.setattr(process.realtime, "set_up", lambda *_: None)
+    bus: Any = None
+    process.run(load_cell(CELL), bus, None, [])
+    assert not made and wired == {"limbs": tuple, "offers": []}
+    process.run(with_pose(model), bus, None, [])
+    assert wired == {"limbs": made[0].newest, "offers": [made[0].offer], "closed": 1}
+    assert made[0].scenes.keys() == {1} and made[0].scenes[1].bound == 0.02
