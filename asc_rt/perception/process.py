@@ -66,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def run(cell: Cell, bus: Bus, clock: CellClock | None, stop: Sequence[int]) -> None:
-    """Until `stop` is not empty. CameraError, BackgroundError."""
+    """Until `stop` is not empty. CameraError, BackgroundError, PoseError."""
     assert cell.perception is not None
     cv2.setNumThreads(1)
     opened = open_all(cell.perception, stop)
