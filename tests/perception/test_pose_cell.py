@@ -15,6 +15,7 @@ import pytest
 
 from asc_rt import doctor
 from asc_rt.config import Cell, ConfigError, load_cell
+from asc_rt.core.types import MAX_CAPSULES
 from asc_rt.ladder.identity import cell_hash
 from asc_rt.perception import process
 from asc_rt.perception.grid import Grid, View
@@ -150,3 +151,12 @@ def test_frames_go_to_the_estimator_and_its_limbs_to_the_sensor(model: Path, mon
     process.run(with_pose(model), bus, None, [])
     assert wired == {"limbs": made[0].newest, "offers": [made[0].offer], "closed": 1}
     assert made[0].scenes.keys() == {1} and made[0].scenes[1].bound == 0.02
+
+
+def test_several_sensors_share_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Control takes no message of too many capsules."""
+    eyes = [SimpleNamespace(info=SimpleNamespace(period_ns=66_000_000))]
+    monkeypatch.setattr(process, "observer_of", lambda *_: (None, eyes))
+    more = ('human.sensors=["person", "other"]', 'human.calibrations={other = "ground-truth"}')
+    for overrides, capsules in ((), MAX_CAPSULES), (more, MAX_CAPSULES // 2):
+        assert process.sensor_of(load_cell(CELL, overrides), [])._identity.capsules == capsules
