@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from asc_rt.cell_files import Camera, CellFile, Perception
+from asc_rt.cell_files import Camera, CellFile, Perception, Pose
 from asc_rt.faults import Faults
+from asc_rt.perception.pose import BACKENDS
 from calibration.result import CalibrationError, Result, load
 from drivers import registry
 
@@ -38,6 +39,13 @@ class CameraOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class PoseOptions:
+    backend: str  # of asc_rt.perception.pose
+    model: Path
+    digest: bytes  # 32, of the model
+
+
+@dataclass(frozen=True, slots=True)
 class PerceptionOptions:
     sensor: str  # one of human.sensors
     remote: bool  # on another machine
@@ -48,11 +56,13 @@ class PerceptionOptions:
     detection: float  # m
     record: bool  # what the cameras see, too
     cameras: tuple[CameraOptions, ...]
+    pose: PoseOptions | None = None
 
     @property
     def digest(self) -> bytes:
         """32 bytes: what the sensor's messages carry as their calibration. One other file, and it is another."""
-        return hashlib.sha256(b"".join(camera.digest for camera in self.cameras)).digest()
+        model = b"" if self.pose is None else self.pose.digest
+        return hashlib.sha256(b"".join(camera.digest for camera in self.cameras) + model).digest()
 
 
 def options(path: Path, cell: CellFile, faults: Faults) -> PerceptionOptions | None:
@@ -63,6 +73,7 @@ def options(path: Path, cell: CellFile, faults: Faults) -> PerceptionOptions | N
     before = len(faults)
     _check(path, cell, table, faults)
     cameras = [_camera(path, name, camera, faults) for name, camera in sorted(table.camera.items())]
+    pose = None if table.pose is None else _pose(path, table.pose, faults)
     if len(faults) > before:
         return None
     return PerceptionOptions(
@@ -75,6 +86,7 @@ def options(path: Path, cell: CellFile, faults: Faults) -> PerceptionOptions | N
         detection=table.detection_m,
         record=table.record,
         cameras=tuple(camera for camera in cameras if camera is not None),
+        pose=pose,
     )
 
 
@@ -118,6 +130,20 @@ def _camera(path: Path, name: str, camera: Camera, faults: Faults) -> CameraOpti
         return None
     background = folder.resolve() / camera.background
     return CameraOptions(name, camera.device.name, device, pose, lens, clock, background, camera.binning)
+
+
+def _pose(path: Path, pose: Pose, faults: Faults) -> PoseOptions | None:
+    """Whether its library is there and takes the model is found out where perception runs."""
+    if pose.backend not in BACKENDS:
+        known = ", ".join(sorted(BACKENDS))
+        faults.note(path, "perception.pose.backend", f"unknown pose backend {pose.backend!r}; known: {known}")
+    model = path.parent.resolve() / pose.model
+    try:
+        return PoseOptions(pose.backend, model, hashlib.sha256(model.read_bytes()).digest())
+    except OSError as error:
+        told = f"{model}: cannot be read: {error.strerror}; name the model's file, or take [perception.pose] out"
+        faults.note(path, "perception.pose.model", told)
+        return None
 
 
 def _result(path: Path, key: str, file: Path, kind: str, faults: Faults) -> Result | None:

@@ -77,6 +77,13 @@ class Camera(Table):
     binning: Annotated[int, integer(1, 8)] = 1  # so many pixels of the mode of `intrinsics` make one, each way
 
 
+class Pose(Table):
+    """An estimator of people's poses beside the depth layer: what it sees is added, nothing is taken away."""
+
+    backend: Text
+    model: Text  # file, beside the cell file
+
+
 class Perception(Table):
     """People seen by depth cameras, as one sensor of [human]. Lengths in the robot's base frame."""
 
@@ -88,6 +95,7 @@ class Perception(Table):
     margin_m: Annotated[float, number(0.02, 0.2)] = 0.06  # around the robot nothing is told from it
     detection_m: Annotated[float, number(0.01, 0.5)] = 0.07  # width of what is surely seen; for who reads the log
     record: Annotated[bool, Field(strict=True)] = False  # the depth images go into the session's recording, too
+    pose: Pose | None = None  # None: without
     camera: Annotated[dict[SensorName, Camera], Field(min_length=1, max_length=8)]
 
 

@@ -12,6 +12,7 @@ import shutil
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +144,16 @@ def _calibration(cell: Cell) -> Iterator[Finding]:
         yield Finding("calibration", True, f"{sensor.name}: {detail}")
 
 
+def _pose(cell: Cell) -> Iterator[Finding]:
+    """Of a cell with an estimator: whether it takes the model is found out when perception starts."""
+    pose = cell.perception and cell.perception.pose
+    if not pose:
+        return
+    there = find_spec(pose.backend) is not None
+    detail = f"{pose.backend} {'installed' if there else 'not installed'}, model {pose.model.name} {pose.digest.hex()}"
+    yield Finding("pose", there, detail, "uv sync --extra pose, or take [perception.pose] out")
+
+
 def _bus_port(cell: Cell) -> Iterator[Finding]:
     host, _, port = cell.bus_endpoint.removeprefix("tcp/").rpartition(":")
     with socket.socket() as probe:
@@ -164,7 +175,7 @@ def _robot(cell: Cell) -> Iterator[Finding]:
             yield found
 
 
-CELL: tuple[Callable[[Cell], Iterator[Finding]], ...] = (_file, _calibration, _certificate, _bus_port, _robot)
+CELL: tuple[Callable[[Cell], Iterator[Finding]], ...] = (_file, _calibration, _pose, _certificate, _bus_port, _robot)
 
 
 # --- helpers ---------------------------------------------------------------------------------------------------------

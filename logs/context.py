@@ -54,6 +54,7 @@ def _files(cell: Cell) -> dict[str, Path]:
     meshes = {str(mesh.get("filename")) for mesh in ET.fromstring(cell.params.robot.urdf).iter("mesh")}
     files |= {f"mesh/{name}": folder / name for name in meshes}
     files |= {key: cell.path.parent / name for key, name in _texts(cell).items()}
+    files.pop("perception.pose.model", None)  # 9 to 30 MB, and not ours to hand around: `session` has its hash
     return {name: path for name, path in files.items() if path.is_file()}
 
 
@@ -90,7 +91,12 @@ def session(cell: Cell) -> dict[str, str]:
         "host": f"{uname.node} {uname.system} {uname.release} {uname.machine}",
         "python": platform.python_version(),
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
+    } | _pose_model(cell)
+
+
+def _pose_model(cell: Cell) -> dict[str, str]:
+    pose = cell.perception and cell.perception.pose
+    return {"pose_model": f"{pose.model.name} {pose.digest.hex()}"} if pose else {}
 
 
 def _operator() -> str:

@@ -118,6 +118,7 @@ def test_a_driver_knows_neither_bus_nor_log(module: str) -> None:
         ("cv2", ["calibration/", "asc_rt/perception/", "drivers/cameras/", "logs/camera.py"]),
         ("av", ["drivers/cameras/azure.py"]),
         ("can", ["drivers/can/", "sim_hil/"]),
+        ("mediapipe", ["asc_rt/perception/pose/backend_mediapipe.py"]),
         ("mujoco", ["sim_hil/"]),
         (
             "pydantic",

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -145,7 +145,7 @@ def with_lens(info: CameraInfo, options: CameraOptions) -> CameraInfo:
         lens.width, lens.height, fx / bins, fy / bins, (cx - middle) / bins, (cy - middle) / bins,
         tuple(float(v) for v in options.lens.distortion()),
     )  # fmt: skip
-    return CameraInfo(info.model, info.serial, info.firmware, calibrated, info.unit_m, info.period_ns, info.latency_ns)
+    return replace(info, intrinsics=calibrated)
 
 
 class Reader:

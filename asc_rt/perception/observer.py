@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from asc_rt.core.robot_model import RobotModel
 from asc_rt.core.types import Vector
 from asc_rt.perception import kernels
@@ -37,11 +39,16 @@ class Observer:
         self.volume, self._tracker = Volume(grid, views), Tracker(parts)
         self._model, self._margin = model, margin
         self._arm = Arm(model)
+        self.pose_bounds = tuple(pose_bounds)
         self._bound = grid.half_diagonal + max(pose_bounds, default=0.0)
 
     def coverage(self, sees: Sequence[bool]) -> float:
         """Share of the guarded volume that the cameras see which see at all."""
         return self.volume.coverage(sees)
+
+    def to_arm(self, points: np.ndarray, q: Vector) -> np.ndarray:
+        """(n,) m, of the points to the arm at q (rad)."""
+        return kernels.distances(points, *self._arm.capsules(q), self._model.capsules.radius)
 
     def observe(self, t_ns: int, depths: Sequence[Depth | None], q: Vector) -> Seen:
         """`depths`: of each camera, captured at t_ns, None where there is none to be believed; `q` rad at t_ns."""

@@ -20,13 +20,17 @@ import numpy as np
 
 from asc_rt import launch, realtime, topics
 from asc_rt.bus import Bus, BusError, Queue, open_client
+from asc_rt.cell_cameras import PoseOptions
 from asc_rt.clock_sync import CellClock
 from asc_rt.config import Cell, ConfigError, load_cell
 from asc_rt.core.system import System
+from asc_rt.core.types import MAX_CAPSULES
 from asc_rt.human_codec import clock_id
 from asc_rt.perception.background import BackgroundError
 from asc_rt.perception.cameras import CameraError, Frames, Opened, Reader, observer_of, open_all
 from asc_rt.perception.pictures import Pictures
+from asc_rt.perception.pose.limbs import Found, PoseError
+from asc_rt.perception.pose.link import Link, scene
 from asc_rt.perception.sensor import Identity, Sensor, around
 from asc_rt.remote import join
 from drivers.cameras.base import Depth, DepthFrame, frozen
@@ -35,6 +39,7 @@ PRIORITY = 20  # SCHED_FIFO, below all that moves something
 READY_NS = 500_000_000
 WAIT_S = 0.01  # for the next frame
 Offer = Callable[[int, DepthFrame], None]  # number of the camera, frame
+Limbs = Callable[[], Sequence[Found]]
 TOGETHER = 0.4  # of a period, for which the frame of one camera waits for the others'
 
 
@@ -51,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
             raise ConfigError([f"{cell.path}: perception: missing; a cell that sees has a table [perception]"])
         with join(cell, cell.perception.sensor) if given.remote else open_client(cell.bus_endpoint) as bus:
             run(cell, bus, CellClock(bus) if given.remote else None, stop)
-    except (ConfigError, CameraError) as error:
+    except (ConfigError, CameraError, PoseError) as error:
         return _refuse(error.lines, 2)
     except BackgroundError as error:
         return _refuse([str(error)], 2)
@@ -61,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def run(cell: Cell, bus: Bus, clock: CellClock | None, stop: Sequence[int]) -> None:
-    """Until `stop` is not empty. CameraError, BackgroundError."""
+    """Until `stop` is not empty. CameraError, BackgroundError, PoseError."""
     assert cell.perception is not None
     cv2.setNumThreads(1)
     opened = open_all(cell.perception, stop)
@@ -71,11 +76,16 @@ def run(cell: Cell, bus: Bus, clock: CellClock | None, stop: Sequence[int]) -> N
         frames: Frames = queue.SimpleQueue()
         for i, one in enumerate(opened):
             stack.callback(Reader(i, one, frames, _tell).close)
-        offer = _recorded(stack, opened, bus) if cell.perception.record else _unrecorded
-        warm_up(sensor_of(cell, opened, clock), cell)
-        sensor = sensor_of(cell, opened, clock)
+        offers = [_recorded(stack, opened, bus)] if cell.perception.record else []
+        warm = sensor_of(cell, opened, clock)
+        warm_up(warm, cell)
+        limbs: Limbs = tuple
+        if cell.perception.pose is not None:
+            link = _posed(stack, cell.perception.pose, opened, warm)
+            limbs, offers = link.newest, [*offers, link.offer]
+        sensor = sensor_of(cell, opened, clock, limbs)
         realtime.set_up(PRIORITY, None)  # the threads above keep the priority of then
-        _Loop(cell, bus, sensor, frames, offer).run(stop)
+        _Loop(cell, bus, sensor, frames, offers).run(stop)
 
 
 def _recorded(stack: ExitStack, opened: Sequence[Opened], bus: Bus) -> Offer:
@@ -85,21 +95,32 @@ def _recorded(stack: ExitStack, opened: Sequence[Opened], bus: Bus) -> Offer:
     return pictures.offer
 
 
-def _unrecorded(number: int, frame: DepthFrame) -> None:
-    pass
+def _posed(stack: ExitStack, options: PoseOptions, opened: Sequence[Opened], sensor: Sensor) -> Link:
+    """PoseError: no camera gives a picture, or the estimator cannot run."""
+    scenes = {
+        i: scene(eye.view, sensor.observer.pose_bounds[i]) for i, eye in enumerate(sensor.eyes) if eye.info.has_image
+    }
+    if not scenes:
+        names = ", ".join(one.options.name for one in opened)
+        need = "use one that does (realsense with infrared = true), or take [perception.pose] out"
+        raise PoseError([f"perception.pose: no camera of {names} gives a picture; {need}"])
+    link = Link(options, scenes, _tell)
+    stack.callback(link.close)
+    return link
 
 
-def sensor_of(cell: Cell, opened: Sequence[Opened], clock: CellClock | None = None) -> Sensor:
-    """`clock`: of the cell, where it runs on another machine. BackgroundError."""
+def sensor_of(cell: Cell, opened: Sequence[Opened], clock: CellClock | None = None, limbs: Limbs = tuple) -> Sensor:
+    """`clock`: of the cell, where it runs on another machine; `limbs`: as Sensor takes them. BackgroundError."""
     options = cell.perception
     assert options is not None
     observer, eyes = observer_of(options, opened, System(cell.params).model, len(cell.params.human.sensors))
     (number,) = [sensor.id for sensor in cell.params.human.sensors if sensor.name == options.sensor]
     least = around(cell.params.safety.activation_distance)
-    identity = Identity(number, options.digest, options.margin, options.detection, least)
+    share = MAX_CAPSULES // len(cell.params.human.sensors)
+    identity = Identity(number, options.digest, options.margin, options.detection, least, share)
     if clock is None:
-        return Sensor(identity, eyes, observer, clock_id, lambda t_ns: (t_ns, 0))
-    return Sensor(identity, eyes, observer, lambda: clock.id, clock.convert)
+        return Sensor(identity, eyes, observer, clock_id, lambda t_ns: (t_ns, 0), limbs)
+    return Sensor(identity, eyes, observer, lambda: clock.id, clock.convert, limbs)
 
 
 def warm_up(sensor: Sensor, cell: Cell) -> None:
@@ -119,9 +140,9 @@ def _with_a_wall(background: Depth) -> Depth:
 
 
 class _Loop:
-    def __init__(self, cell: Cell, bus: Bus, sensor: Sensor, frames: Frames, offer: Offer) -> None:
+    def __init__(self, cell: Cell, bus: Bus, sensor: Sensor, frames: Frames, offers: Sequence[Offer]) -> None:
         assert cell.perception is not None
-        self._sensor, self._frames, self._offer, self._n = sensor, frames, offer, cell.params.n
+        self._sensor, self._frames, self._offers, self._n = sensor, frames, offers, cell.params.n
         self._people = bus.publisher(topics.human(cell.perception.sensor).key)
         self._ready = bus.publisher(topics.ready(topics.PERCEPTION).key)
         self._joints = bus.queue(topics.JOINTS.key)
@@ -145,12 +166,13 @@ class _Loop:
             self._say(now_ns)
 
     def _collect(self, waiting: dict[int, DepthFrame]) -> None:
-        """The newest frame of each camera; all of them are offered to the recording."""
+        """The newest frame of each camera; all of them are offered to who else wants them."""
         with suppress(queue.Empty):
             number, frame = self._frames.get(timeout=WAIT_S)
             while True:
                 waiting[number] = frame
-                self._offer(number, frame)
+                for offer in self._offers:
+                    offer(number, frame)
                 number, frame = self._frames.get_nowait()
 
     def _is_whole(self, waiting: dict[int, DepthFrame], now_ns: int) -> bool:

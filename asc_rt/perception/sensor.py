@@ -19,10 +19,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from asc_rt import human_state_pb2 as pb
+from asc_rt.core.types import MAX_CAPSULES, Vector
 from asc_rt.human_codec import FRAME, SCHEMA_VERSION
 from asc_rt.perception.arm import JointHistory
 from asc_rt.perception.eye import Eye
 from asc_rt.perception.observer import Observer, Seen
+from asc_rt.perception.pose.added import POSE_BODY, added
+from asc_rt.perception.pose.limbs import Found
 from asc_rt.perception.volume import REACH_SPEED
 from drivers.cameras.base import Depth, DepthFrame
 from drivers.cameras.watch import CameraFault
@@ -44,6 +47,7 @@ class Identity:
     margin: float  # m
     detection: float  # m
     around: float  # m: nobody nearer to the arm may go unseen
+    capsules: int = MAX_CAPSULES  # at most, its share of what control takes
 
 
 def around(activation: float) -> float:
@@ -62,13 +66,14 @@ class Sensor:
     """`take` the frames as they come, `wait` when none do; each gives the messages to send."""
 
     def __init__(
-        self, identity: Identity, eyes: Sequence[Eye], observer: Observer, clock: Callable[[], str], stamp: Stamp
-    ) -> None:
-        """`clock`: name of the cell's clock; `stamp`: ours in its time."""
+        self, identity: Identity, eyes: Sequence[Eye], observer: Observer, clock: Callable[[], str], stamp: Stamp,
+        limbs: Callable[[], Sequence[Found]] = tuple,
+    ) -> None:  # fmt: skip
+        """`clock`: name of the cell's clock; `stamp`: ours in its time; `limbs`: the newest of a pose estimator."""
         self.joints = JointHistory()  # stamped by the cell's clock
         self.eyes = tuple(eyes)
         self.observer = observer
-        self._identity, self._clock, self._stamp = identity, clock, stamp
+        self._identity, self._clock, self._stamp, self._limbs = identity, clock, stamp, limbs
         self._session, self._seq, self._t_ns = str(uuid.uuid4()), 0, 0
         self._period_ns = min(eye.info.period_ns for eye in eyes)
 
@@ -149,8 +154,17 @@ class Sensor:
             bodies=[] if seen is None else [_body(seen, pb.PREDICTED if blind else pb.OBSERVED)],
             empty_certified=health == pb.HEALTH_OK,
         )
+        if q is not None and seen is not None and (limbs := self._added(seen, q)):
+            message.bodies.append(pb.Body(id=POSE_BODY, capsules=limbs))
+            message.method = pb.METHOD_FUSED
         data: bytes = message.SerializeToString()
         return data
+
+    def _added(self, seen: Seen, q: Vector) -> list[pb.Capsule]:
+        """All else that is told is as without them."""
+        believed = [one for one in self._limbs() if self.eyes[one.camera].is_believed]
+        room = self._identity.capsules - len(seen.parts.radius)
+        return added(believed, seen, room, lambda points: self.observer.to_arm(points, q))
 
     def _health(self, seen: Seen | None, bits: int) -> pb.Health:
         if seen is None or not any(eye.is_believed for eye in self.eyes):

@@ -35,7 +35,7 @@ class Volume:
         self._free = [view.free(view.background) for view in views]
         self.guarded = np.logical_or.reduce(self._free)  # seen free in the empty cell
         self._sources = self._unseen_entries()
-        self._steps = [_steps(view) for view in views]
+        self._steps = [steps(view) for view in views]
         self._possible = np.ones(len(self._centres), np.uint8)
         self._unseen = self._possible > 0  # at the last capture
         self._t_ns: int | None = None
@@ -123,7 +123,7 @@ def _each_layer(block: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     return cv2.dilate(np.ascontiguousarray(block), kernel)
 
 
-def _steps(view: View) -> np.ndarray:
+def steps(view: View) -> np.ndarray:
     """(height, width) counts before the background that noise does not explain."""
     sigma = depth_sigma(view.background * view.unit)
     return np.rint(np.maximum(BACKGROUND_STEP, 4.0 * sigma) / view.unit).astype(np.int32)

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from drivers.base import DriverError
 
 Depth = npt.NDArray[np.uint16]  # (height, width) counts of `unit_m` along the optical axis; 0: no measurement
+Image = npt.NDArray[np.uint8]  # (height, width) or (height, width, 3) RGB: its pixels are the depth's
 
-__all__ = ["CameraInfo", "Depth", "DepthCamera", "DepthFrame", "DriverError", "Intrinsics"]
+__all__ = ["CameraInfo", "Depth", "DepthCamera", "DepthFrame", "DriverError", "Image", "Intrinsics"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,7 @@ class CameraInfo:
     unit_m: float  # metres per count; never assumed
     period_ns: int  # nominal
     latency_ns: int  # least time from mid-exposure to arrival: no frame can be younger
+    has_image: bool = False  # its frames bring a picture, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,7 @@ class DepthFrame:
     t_device_ns: int  # the device's own clock; compared with itself only
     t_arrival_ns: int  # when the frame reached this process
     seq: int  # the device's count: a gap is a lost frame
+    image: Image | None = None  # read-only, of the same exposure; for who recognises things, never for distances
 
     @property
     def invalid_ratio(self) -> float:
@@ -89,11 +92,18 @@ def frozen(depth: npt.NDArray[Any]) -> Depth:
     return image
 
 
+def frozen_image(picture: npt.NDArray[Any]) -> Image:
+    """A read-only picture, its own memory."""
+    image = np.array(picture, dtype=np.uint8, order="C")
+    image.setflags(write=False)
+    return image
+
+
 def check_options(name: str, options: dict[str, Any], known: dict[str, type | tuple[type, ...]]) -> None:
     """ValueError, one line per fault: an option that is not `known`, or not of its kind."""
     faults = [f"{name}: unknown option {key}; known: {', '.join(known)}" for key in sorted(options.keys() - known)]
     for key in known.keys() & options.keys():
-        if isinstance(options[key], bool) or not isinstance(options[key], known[key]):
+        if isinstance(options[key], bool) != (known[key] is bool) or not isinstance(options[key], known[key]):
             faults.append(f"{name}: {key}: {options[key]!r} is not possible")
     if faults:
         raise ValueError("\n".join(faults))

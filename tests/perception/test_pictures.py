@@ -108,7 +108,7 @@ def test_perception_offers_every_frame_that_came_and_says_them_where_the_logger_
     frames: Frames = queue.SimpleQueue()
     waiting: dict[int, DepthFrame] = {}
     with ExitStack() as stack:
-        loop = process._Loop(load_cell("fanuc-sim"), bus, sensor, frames, process._recorded(stack, opened, bus))
+        loop = process._Loop(load_cell("fanuc-sim"), bus, sensor, frames, [process._recorded(stack, opened, bus)])
         for i in range(2):
             frames.put((0, frame(i, T0_NS + i * MS)))
         loop._collect(waiting)
