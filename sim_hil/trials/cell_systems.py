@@ -23,11 +23,12 @@ class CellSystem:
     cell: str  # name or file
     tools: tuple[str, ...]
     goals_deg: tuple[tuple[float, ...], ...] = ()  # (): the cell's
+    overrides: tuple[str, ...] = ()  # of the cell file, as `asc run --set` takes them
 
     @property
     def loaded(self) -> Cell:
         """ConfigError."""
-        return _cell(self.cell, self.tools[0])
+        return _cell(self.cell, self.tools[0], self.overrides)
 
     @property
     def name(self) -> str:
@@ -101,7 +102,7 @@ class CellSystem:
 
 
 @lru_cache(maxsize=32)
-def _cell(name: str, tool: str) -> Cell:
+def _cell(name: str, tool: str, overrides: tuple[str, ...]) -> Cell:
     """A cell without a changer is taken with the tool of the suite."""
-    cell = load_cell(name)
-    return cell if cell.params.changer.mounts else load_cell(name, [f"tool={tool}"])
+    cell = load_cell(name, overrides)
+    return cell if cell.params.changer.mounts else load_cell(name, [*overrides, f"tool={tool}"])

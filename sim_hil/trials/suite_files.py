@@ -44,6 +44,7 @@ class Rules(Table):
 
 class SuiteFile(Table):
     systems: Annotated[list[SystemTable], Field(min_length=1)]
+    set: list[Text] = []  # over every cell file: "monitor.enforce=true", as `asc run --set` takes them
     person: Literal["stands", "visits", "roams", "live"]
     seed: Annotated[int, integer(0, 2**31 - 1)] = 0  # of every draw
     trials: Annotated[int, integer(1, 100000)]  # per system and policy

@@ -127,7 +127,7 @@ def find(name: str) -> Suite:
 @lru_cache(maxsize=4)
 def _of_file(path: Path) -> Suite:
     f = suite_files.load(path)
-    systems = tuple(CellSystem(s.cell, tuple(s.tools), tuple(map(tuple, s.goals_deg))) for s in f.systems)
+    systems = tuple(CellSystem(s.cell, tuple(s.tools), tuple(map(tuple, s.goals_deg)), tuple(f.set)) for s in f.systems)
     lines = [f"{path}: systems[{i}]: {line}" for i, s in enumerate(systems) for line in s.faults(SPHERE in f.policies)]
     if f.person == "live":
         lines.append(f"{path}: person: nobody is live in simulation; stands, visits or roams (live: asc trials ladder)")

@@ -16,7 +16,7 @@ from logs.audit import audit
 from sim_hil import swap_picture
 from sim_hil.person import Person
 from sim_hil.plant import MujocoPlant
-from sim_hil.trials import file_trials, report, suites
+from sim_hil.trials import episode, file_trials, report, suites
 from sim_hil.trials.cell_systems import NOBODY_KNOWS, CellSystem
 from sim_hil.trials.judge import Outcome
 from sim_hil.trials.sensing import Ball, Blind, Perfect
@@ -64,6 +64,11 @@ def test_a_suite_is_a_file() -> None:
             'tools = ["bat"]',
             'tools = ["bat"]\ngoals_deg = [[0, 0]]',
             "systems[1]: goals_deg: 2 angles; lrmate_200id has",
+        ),
+        (
+            'person = "stands"',
+            'person = "stands"\nset = ["monitor.enfrce=true"]',
+            "monitor.enfrce: unknown key; did you mean",
         ),
         ('person = "stands"', "", "person: missing; one of stands, visits, roams, live"),
         ('"none"]', '"nothing"]', "policies[3]: nothing is not possible"),
@@ -237,6 +242,19 @@ def test_a_swapped_trial_is_the_same_again_and_the_robot_causes_nothing(tmp_path
 def test_nobody_who_roams_is_harmed_by_the_arm_on_a_trial_of_the_campaign(system: int) -> None:
     outcome = suites.run(Job("campaign", system, "asc", 3, 0))
     assert outcome.robot_caused == 0 and not outcome.limits_exceeded and outcome.reached > 0, outcome.notes
+
+
+@pytest.mark.parametrize(("system", "trial"), [(0, 166), (0, 334), (1, 944), (1, 1081), (4, 1241)])
+def test_a_hand_that_is_faster_than_what_is_known_of_it_finds_an_arm_at_rest(system: int, trial: int) -> None:
+    """MEASURED: 32 of 10 000 trials without the protective distance, at up to 0.4 m/s; (0, 166) also with it at
+    1.6 m/s of people."""
+    suite = suites.find("campaign")
+    assert suite.file is not None
+    outcome = suites.run(Job("campaign", system, "asc", trial, 1))
+    assert outcome.robot_caused == 0 and not outcome.limits_exceeded, outcome.notes
+    unenforced = dataclasses.replace(suite.systems[system], overrides=())
+    bare = episode.run(file_trials.setup(suite.file, unenforced, "asc", trial, 1))
+    assert bare.robot_caused > 0, "these trials show nothing any more: draw others"
 
 
 def row(policy: str, extra: float, reached: int, seconds: float = 1.0) -> dict[str, object]:
