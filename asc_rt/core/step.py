@@ -47,7 +47,7 @@ def decide(system: System, state: CoreState, x: CycleInputs) -> tuple[CoreState,
     level = LEVELS[params.control]
     state = level.track(system, state, x)
     other_mass = bool(x.events) and changer.weighs_other(params, state, system, x)
-    watched = watch(system, x)
+    watched = watch(system, state, x)
     state = mode.next_mode(params, state, x, d_measured, watched, other_mass)
     if mode.cut_off(state):  # the robot would hear no set-point: leave the session
         state = dataclasses.replace(state, mode=Mode.FAULT)

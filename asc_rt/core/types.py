@@ -289,7 +289,7 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
-    """Speed and separation monitoring in ISO's terms, of the measured robot; see separation_monitor."""
+    """Speed and separation monitoring in ISO's terms; see separation_monitor."""
 
     distance: float  # m, to where the person was seen; inf: nobody is there
     protective_distance: float  # m, S_p

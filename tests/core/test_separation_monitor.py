@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asc_rt.core.params import MonitorParams
-from asc_rt.core.separation_monitor import greatest_speed, protective_distance, stopping_time
+from asc_rt.core.separation_monitor import greatest_speed, protective_distance, ramped_down, stopping_time, watch
+from asc_rt.core.types import vector
 
 times, speeds, lengths = st.floats(0.0, 2.0), st.floats(0.0, 5.0), st.floats(0.0, 1.0)
 monitors = st.builds(MonitorParams, human_speed=speeds, intrusion_distance=lengths, robot_uncertainty=lengths)
@@ -97,3 +98,41 @@ def test_the_fastest_point_against_pinocchio(bench: Any) -> None:
 def test_a_speed_that_is_no_number_is_the_greatest(bench: Any) -> None:
     system = bench.system()
     assert greatest_speed(system.model.chain, system.model.capsules, bench.HOME, np.full(6, np.nan)) == np.inf
+
+
+@given(v=st.floats(-6.0, 6.0), a=st.floats(-100.0, 100.0), J=st.floats(10.0, 2000.0))
+def test_an_acceleration_is_ramped_down_before_the_joint_brakes(v: float, a: float, J: float) -> None:
+    """Against the ramp itself, step by step: the joint is never faster than told, at its end as fast as told."""
+    fastest, ramp = ramped_down(np.array([v]), np.array([a]), np.array([J]))
+    t = np.linspace(0.0, abs(a) / J, 400)
+    speeds = v + a * t - np.sign(a) * J * t * t / 2.0
+    if v * a >= 0.0 or speeds[-1] * v < 0.0:
+        assert ramp == pytest.approx(abs(a) / J)
+        assert fastest[0] == pytest.approx(speeds[-1], abs=1e-9)
+    else:
+        assert (fastest[0], ramp) == (v, 0.0)
+    assert np.all(np.abs(speeds) <= max(abs(v), abs(fastest[0])) + 1e-9)
+
+
+def test_the_distance_is_that_of_the_motion_the_robot_was_told(bench: Any) -> None:
+    """The arm is measured at rest in all of these: what was sent acts one latency later and may still grow."""
+    rig = bench.Rig(bench.system(), lambda t: bench.human([[1.15, 0.0, 0.3]]))
+    x, state, one = rig.cycle().x, rig.state, np.eye(6)[0]
+
+    def told(dq: Any, ddq: Any) -> Any:
+        found = watch(rig.system, dataclasses.replace(state, dq_cmd=vector(dq), ddq_cmd=vector(ddq)), x)
+        assert found is not None
+        return found
+
+    rest, moves, starts = told(0 * one, 0 * one), told(one, 0 * one), told(0 * one, 5.0 * one)
+    J = rig.system.bounds.dddq_max[0]
+    assert rest.robot_speed == 0.0 and rest.stopping_time == 0.0
+    assert moves.robot_speed == pytest.approx(
+        greatest_speed(rig.system.model.chain, rig.system.model.capsules, state.q_cmd, one)
+    )
+    assert starts.reaction_time == pytest.approx(rest.reaction_time + 5.0 / J)
+    after = (rig.system.params.period * 5.0 + 5.0**2 / (2.0 * J)) * one
+    assert starts.stopping_time == pytest.approx(
+        stopping_time(after, rig.system.bounds.ddq_max, rig.system.bounds.dddq_max)
+    )
+    assert rest.protective_distance < starts.protective_distance < moves.protective_distance

@@ -257,6 +257,12 @@ def test_a_hand_that_is_faster_than_what_is_known_of_it_finds_an_arm_at_rest(sys
     assert bare.robot_caused > 0, "these trials show nothing any more: draw others"
 
 
+def test_a_hand_comes_to_an_arm_that_has_just_started() -> None:
+    """MEASURED: an S_p of the measured speed alone stopped it too late, since it was told to go faster already."""
+    outcome = suites.run(Job("campaign", 0, "asc", 49, 1))
+    assert outcome.robot_caused == 0 and outcome.stops > 0, outcome.notes
+
+
 def row(policy: str, extra: float, reached: int, seconds: float = 1.0) -> dict[str, object]:
     zero = dict.fromkeys(("robot_caused", "limits_exceeded"), 0)
     paired = {"paired": {"seconds_per_goal": {"median": seconds}}}
