@@ -32,7 +32,7 @@ CORE, TESTS = HERE.parents[1] / "asc_rt" / "core", HERE.parents[1] / "tests" / "
 # What is mutated, and the tests that speak of it, the most telling first.
 TARGETS = {
     "abstraction.py": ("test_abstraction.py", "test_safety_index.py", "test_gradient.py"),
-    "radius.py": ("test_abstraction.py", "test_gradient.py"),
+    "radius.py": ("test_radius.py", "test_abstraction.py", "test_gradient.py"),
     "polytope.py": ("test_polytope.py", "test_abstraction.py", "test_safe_control.py"),
     "people.py": ("test_people.py",),
     "safety_index.py": ("test_safety_index.py",),
