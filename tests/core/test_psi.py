@@ -1,4 +1,4 @@
-"""psi to the accuracy that its search promises, and at its edges: where the approach begins later, and with little M."""
+"""psi to the accuracy of its search, and at its edges: where the approach begins later, and with little M."""
 
 from __future__ import annotations
 
@@ -39,16 +39,17 @@ def largest(d: float, v: float, a: float, M: float, J: float, index: Index) -> f
 def states(count: int, seed: int) -> Any:
     rng = np.random.default_rng(seed)
     for _ in range(count):
-        yield rng.uniform([0.0, 0.0, -6.0, 1.0, 8.0, 0.3], [1.2, 2.0, 6.0, 12.0, 200.0, 8.0])
+        yield rng.uniform([0.0, 0.0, -6.0, 0.4, 8.0, 0.3], [1.2, 2.0, 6.0, 3.0, 200.0, 8.0])
+        yield rng.uniform([0.3, 0.0, 0.0, 1.0, 4.0, 0.3], [1.5, 2.0, 8.0, 12.0, 30.0, 8.0])  # a long ramp
 
 
-def test_the_search_for_the_largest_phi_is_as_near_to_it_as_it_promises() -> None:
-    """1e-5, however the peak lies: on the ramp, after it, at its corner, behind the surface."""
+def test_the_search_finds_the_largest_phi() -> None:
+    """A hundred times nearer than it promises; the peak is on the ramp, after it or at its corner."""
     inner = 0
-    for d, v, a, M, J, k in states(600, 0):
+    for d, v, a, M, J, k in states(500, 0):
         index = STAR._replace(k=k)
         found, expected = psi(d, v, a, M, 0.0, J, index), largest(d, v, a, M, J, index)
-        assert found == pytest.approx(expected, abs=1e-5)
+        assert found == pytest.approx(expected, abs=1e-7)
         inner += found > phi(d, v, M, index) + 1e-3
     assert inner > 100
 

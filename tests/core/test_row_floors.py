@@ -89,7 +89,12 @@ def test_what_is_left_of_a_floor_where_rows_conflict() -> None:
 def test_the_end_of_a_ramp_is_no_more_than_the_bounds_or_M_give() -> None:
     late, at_once = Pair(d=0.15, v=1.9, v_robot=1.9, M=9.0), STAR._replace(eta=100.0)  # nearly all, and this period
     within = ALONG + 0.6 * (MOST - ALONG) - 1e-3
-    assert late.row(index=at_once)[1:] == (pytest.approx(within), pytest.approx(ALONG - 0.26), Basis.RAMP, Outside.NOTHING)
+    assert late.row(index=at_once)[1:] == (
+        pytest.approx(within),
+        pytest.approx(ALONG - 0.26),
+        Basis.RAMP,
+        Outside.NOTHING,
+    )
     assert late._replace(M=0.5).row(index=at_once).floor == pytest.approx(0.8 * 0.5 + 0.4)  # BRAKE_SHARE M - drift
     beyond = np.array([5.0, 0.0])  # no control of this period gives as much as the last one gave
     assert late.row(index=at_once, ddq=beyond).floor == pytest.approx(MOST - 1e-3)
@@ -99,7 +104,9 @@ def test_the_end_of_a_ramp_is_no_more_than_the_bounds_or_M_give() -> None:
     ("d", "creep"), [(0.3, STANDSTILL_SPEED), (0.102, 0.001), (0.1, STANDSTILL_LEAST), (0.05, STANDSTILL_LEAST)]
 )
 @pytest.mark.parametrize("at_once", [False, True])
-def test_at_a_standstill_the_robots_own_approach_is_over_when_its_ramp_is(d: float, creep: float, at_once: bool) -> None:
+def test_at_a_standstill_the_robots_own_approach_is_over_when_its_ramp_is(
+    d: float, creep: float, at_once: bool
+) -> None:
     """A person faster than the arm: the robot keeps no more than a creep, of its own."""
     pair = Pair(d=d, v=1.9, v_robot=0.01)
     found = pair.row(index=STAR._replace(at_once=at_once))
@@ -152,7 +159,7 @@ def test_inside_d_min_and_near_a_person_too_fast_no_less_than_a_standstill_is_as
     too_fast = STAR._replace(v_max=1.8)
     row = fast.row(strong, too_fast)
     assert (row.basis, row.outside) == (Basis.STANDSTILL, Outside.SPEED)
-    assert fast._replace(d=0.6).row(strong, too_fast).basis == Basis.INDEX  # 0.1 + 1.9 m/s for a quarter of a second: not near
+    assert fast._replace(d=0.6).row(strong, too_fast).basis == Basis.INDEX  # not near any more
 
 
 def test_a_pair_that_the_control_hardly_reaches_is_asked_for_no_more_than_the_brake_gives() -> None:
@@ -195,6 +202,7 @@ def test_phi_rate_without_M_is_that_of_the_distance_alone() -> None:
     for M in (0.0, -2.0):
         assert phi_rate(0.5, -0.7, 1.0, M, 3.0, STAR) == 0.7
     assert phi_rate(0.5, 0.7, 1.0, 0.5, 3.0, STAR) == -0.7  # phi0 is the larger
+    assert phi_rate(0.5, -0.7, 1.0, 0.5, 3.0, STAR) == pytest.approx(0.7 - 3.0 / 0.5 - 3.0 * 0.7 * 3.0 / 0.25)
 
 
 def test_both_indices_by_hand() -> None:
