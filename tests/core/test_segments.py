@@ -19,6 +19,12 @@ def person(ends: Segment, v: Segment = (STILL, STILL), radius: float = 0.0) -> P
     return People(p0, p1, v0, v1, np.full(1, radius), np.zeros(1))
 
 
+def world(ends: Segment) -> Segment:
+    """As the kernels have a capsule's ends, so that none is compiled anew."""
+    p0, p1 = (tuple(float(x) for x in end) for end in ends)
+    return p0, p1
+
+
 def crossing(rng: Any, lengths: Any, gap: float) -> tuple[Segment, Segment]:
     """Two segments at 20 degrees or more whose nearest points are inside both, `gap` apart."""
     angle, middle = rng.uniform(0.35, np.pi - 0.35), rng.uniform(-1.0, 1.0, 3)
@@ -38,11 +44,11 @@ def test_the_distance_of_segments_of_every_length(bench: Any) -> None:
     for _ in range(300):
         lengths, gap = 10.0 ** rng.uniform(-5.0, 0.0, 2), rng.uniform(0.01, 0.5)
         robot, human = crossing(rng, lengths, gap)
-        assert distance(*robot, 0.03, person(human, radius=0.02), 0) == pytest.approx(gap - 0.05, abs=1e-9)
+        assert distance(*world(robot), 0.03, person(human, radius=0.02), 0) == pytest.approx(gap - 0.05, abs=1e-9)
         # and wherever the nearest points are
         moved = [end + rng.normal(size=3) * lengths[1] for end in human]
-        expected = bench.segment_distance(*robot, *moved)
-        assert distance(*robot, 0.0, person((moved[0], moved[1])), 0) == pytest.approx(expected, abs=1e-7)
+        expected = bench.segment_distance(*world(robot), *moved)
+        assert distance(*world(robot), 0.0, person((moved[0], moved[1])), 0) == pytest.approx(expected, abs=1e-7)
 
 
 def test_a_point_is_a_segment_too_and_nothing_is_divided_by_its_length(bench: Any) -> None:
@@ -51,8 +57,8 @@ def test_a_point_is_a_segment_too_and_nothing_is_divided_by_its_length(bench: An
         for x in (-0.3, 0.2, 0.9):  # before, beside and behind the other
             point = np.array([x, 0.5, 0.3])
             for robot, human in (((point, point), (a, b)), ((a, b), (point, point)), ((point, point), (a, a))):
-                expected = bench.segment_distance(*robot, *human)
-                assert distance(*robot, 0.0, person(human), 0) == pytest.approx(expected, abs=1e-12)
+                expected = bench.segment_distance(*world(robot), *human)
+                assert distance(*world(robot), 0.0, person(human), 0) == pytest.approx(expected, abs=1e-12)
 
 
 def test_spheres_around_both_are_never_farther_than_the_capsules() -> None:
@@ -61,11 +67,11 @@ def test_spheres_around_both_are_never_farther_than_the_capsules() -> None:
     for _ in range(300):
         p0, p1, q0, q1 = rng.uniform(-1.0, 1.0, (4, 3))
         people, radius = person((q0, q1), radius=rng.uniform(0.0, 0.1)), rng.uniform(0.0, 0.1)
-        assert _at_least(p0, p1, radius, people, 0) <= distance(p0, p1, radius, people, 0)
+        assert _at_least(*world((p0, p1)), radius, people, 0) <= distance(*world((p0, p1)), radius, people, 0)
         in_line = person((p1 + 0.2 * (p1 - p0), p1 + rng.uniform(0.3, 3.0) * (p1 - p0)), radius=0.05)
         exact = 0.2 * np.linalg.norm(p1 - p0) - radius - 0.05
         for robot in ((p0, p1), (p1, p0)):
-            assert exact - 2.0 * ROUNDING < _at_least(*robot, radius, in_line, 0) < exact
+            assert exact - 2.0 * ROUNDING < _at_least(*world(robot), radius, in_line, 0) < exact
 
 
 def test_what_the_base_carries_feels_only_how_the_person_moves_however_short_they_are(bench: Any) -> None:
@@ -83,14 +89,14 @@ def test_what_the_base_carries_feels_only_how_the_person_moves_however_short_the
 
         def at(t: float, robot: Any = robot, human: Any = human, v: Any = v) -> float:
             ends = (end + t * speed for end, speed in zip(human, v, strict=True))
-            return float(bench.segment_distance(*robot, *ends))
+            return float(bench.segment_distance(*world(robot), *ends))
 
         behind, now, ahead, far_behind, far_ahead = (at(t) for t in (-h, 0.0, h, -2.0 * h, 2.0 * h))
         rate, bend = (ahead - behind) / (2.0 * h), (ahead - 2.0 * now + behind) / h**2
         if abs((far_ahead - 2.0 * now + far_behind) / (4.0 * h**2) - bend) > 1e-2:
             continue  # a nearest point reaches an end
         C = np.ones(1)
-        d_dot, drift, own, own_drift = pair(motion, -1, *robot, person(human, v), 0, 3.0, C)
+        d_dot, drift, own, own_drift = pair(motion, -1, *world(robot), person(human, v), 0, 3.0, C)
         assert (C[0], own, own_drift) == (0.0, 0.0, 0.0)
         assert d_dot == pytest.approx(rate, abs=1e-5)
         assert drift == pytest.approx(bend - 3.0, abs=1e-2)
