@@ -13,7 +13,7 @@ from asc_rt.core.gate import ROUNDING, keeps_rows, may_pass, torque_may_pass
 from asc_rt.core.safe_control import SOLVER_MARGIN
 from asc_rt.core.smoothing import SetPoint
 from asc_rt.core.system import System, initial
-from asc_rt.core.types import CoreState, vector
+from asc_rt.core.types import CoreState, Mode, vector
 
 T = 0.008
 ONE = np.eye(6)[3]
@@ -51,6 +51,18 @@ def test_what_is_no_number_never_passes(bench: Any, field: str) -> None:
     assert may_pass(system, rest, still)
     for bad in (np.nan, np.inf):
         assert not may_pass(system, rest, replace(still, **{field: vector(np.where(ONE > 0, bad, 0.0))}))
+
+
+def test_a_slower_tool_counts_while_it_works_and_the_arms_own_speed_while_it_stops(bench: Any) -> None:
+    """Or a tool that came during a stop would end that stop in a fault."""
+    params = bench.params()
+    arms_own = np.array(params.robot.dq_max)
+    slow = replace(params.robot, dq_max=tuple(0.5 * arms_own))
+    system, zero = System(replace(params, robot=slow), arms_own), vector(np.zeros(6))
+    for mode, fastest in ((Mode.ACTIVE, 0.5 * arms_own), (Mode.STOPPING, arms_own)):
+        state = replace(initial(system), q_cmd=zero, mode=mode)
+        for wide, passes in ((1.0, True), (1.01, False)):
+            assert may_pass(system, state, SetPoint(zero, vector(wide * fastest * ONE), zero, zero)) is passes
 
 
 def test_the_jerk_is_that_from_the_acceleration_before(bench: Any) -> None:

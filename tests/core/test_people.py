@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from asc_rt.core.people import predict
+from asc_rt.core.people import COLUMNS, is_finite, predict
 from asc_rt.core.types import vector
 
 
@@ -33,3 +33,14 @@ def test_people_go_on_at_their_speed_and_grow_by_what_is_not_known(bench: Any, h
     np.testing.assert_allclose(people.radius, [0.1 + 0.01 + 0.1, 0.2 + 0.02 + 0.05])
     for same in ("v0", "v1", "velocity_bound"):
         np.testing.assert_array_equal(getattr(people, same), getattr(human, same))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_one_figure_that_is_no_number_is_one_too_many(bad: float) -> None:
+    people = np.ones((2, COLUMNS))
+    assert is_finite(people)
+    assert is_finite(people[:0])
+    for k in range(people.size):
+        broken = people.copy()
+        broken.flat[k] = bad
+        assert not is_finite(broken)

@@ -31,11 +31,11 @@ HERE = Path(__file__).parent
 CORE, TESTS = HERE.parents[1] / "asc_rt" / "core", HERE.parents[1] / "tests" / "core"
 # What is mutated, and the tests that speak of it, the most telling first.
 TARGETS = {
-    "abstraction.py": ("test_abstraction.py", "test_safety_index.py", "test_gradient.py"),
-    "radius.py": ("test_abstraction.py", "test_gradient.py"),
+    "abstraction.py": ("test_segments.py", "test_abstraction.py", "test_safety_index.py", "test_gradient.py"),
+    "radius.py": ("test_radius.py", "test_abstraction.py", "test_gradient.py"),
     "polytope.py": ("test_polytope.py", "test_abstraction.py", "test_safe_control.py"),
     "people.py": ("test_people.py",),
-    "safety_index.py": ("test_safety_index.py",),
+    "safety_index.py": ("test_row_floors.py", "test_psi.py", "test_stopping_distance_index.py", "test_safety_index.py"),
     "stopping.py": ("test_limits.py", "test_safety_index.py"),
     "limits.py": ("test_limits.py", "test_abstraction.py"),
     "safe_control.py": ("test_safe_control.py",),
