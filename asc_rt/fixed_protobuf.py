@@ -49,8 +49,10 @@ class Message:
     """One dataclass as a protobuf message. Fields: name -> Python type, Array or Message; the order numbers them.
 
     `optional`: None is a value of its own (a flag `present`). `capacity`: the arrays hold 0..capacity rows (a field
-    `count`), else n. `rows`: a tuple of 0..capacity dataclasses, written as columns. `kept`: often the same object in
-    the next record. Scalars stand before arrays, arrays before messages, whatever order the table has.
+    `count`), else n. `rows`: a tuple of 0..capacity dataclasses, written as columns. `table`: the dataclass has a
+    `count` and one float64 array, `table`, (arrays, capacity), with the arrays as its rows, whole numbers by their
+    bits. `kept`: often the same object in the next record. Scalars stand before arrays, arrays before messages,
+    whatever order the table has.
     """
 
     def __init__(
@@ -61,9 +63,11 @@ class Message:
         optional: bool = False,
         capacity: int = 0,
         rows: bool = False,
+        table: bool = False,
         kept: bool = False,
     ) -> None:
-        self.cls, self.optional, self.capacity, self.rows, self.kept = cls, optional, capacity, rows, kept
+        self.cls, self.optional, self.capacity, self.kept = cls, optional, capacity, kept
+        self.rows, self.table = rows, table
         self.messages = {k: v for k, v in fields.items() if isinstance(v, Message)}
         self.arrays = {k: v for k, v in fields.items() if isinstance(v, Array)}
         self.scalars = {k: v for k, v in fields.items() if k not in self.messages and k not in self.arrays}
@@ -159,13 +163,18 @@ def _pieces(message: Message, n: int, path: str, it: str, leaves: Iterator[Leaf]
         rows, first = f"rows_{path.replace('.', '_')}", next(iter(message.arrays))
         leaf = next(leaves)
         yield leaf.tag
-        fits = f"({rows} := len({it}.{first})) <= {message.capacity}"
+        number = f"{it}.count" if message.table else f"len({it}.{first})"
+        fits = f"0 <= ({rows} := {number}) <= {message.capacity}"
         yield Value(leaf.code, f"{rows} if {fits} else misfit({path!r}, 'more than {message.capacity} rows')")
     for name in message.scalars:
         leaf = next(leaves)
         yield leaf.tag
         yield Value(leaf.code, f"{it}.{name}")
-    for name, array in message.arrays.items():  # struct would pad or cut silently
+    if message.table:
+        columns, name = list(itertools.islice(leaves, len(message.arrays))), f"table_{path.replace('.', '_')}"
+        names[name] = _table(path, columns, message.capacity)
+        yield Value(f"{sum(len(leaf.tag) + leaf.size for leaf in columns)}s", f"{name}({it}.table)")
+    for name, array in {} if message.table else message.arrays.items():  # struct would pad or cut silently
         leaf = next(leaves)
         yield leaf.tag
         fits = f"len(data := {it}.{name}.tobytes()) == {8 * array.width} * {rows}"
@@ -184,37 +193,48 @@ def _choice(message: Message, n: int, path: str, it: str, leaves: list[Leaf], na
     if not (message.kept or message.rows):
         return Choice(it, name, absent, list(_pieces(message, n, path, name, iter(leaves), names)))
     if message.rows:
-        pack = _rows(message, path, leaves)
+        names[name] = _rows(message, path, leaves)
     else:
         own: Names = {}
-        pack = compiled(list(_pieces(message, n, path, "it", iter(leaves), own)), "it", own)
-    names[name] = _kept(pack, absent)
-    return Value(f"{len(absent)}s", f"{name}({it})")
+        names[name] = _kept(compiled(list(_pieces(message, n, path, "it", iter(leaves), own)), "it", own), len(absent))
+    return Value(f"{len(absent)}s", f"{name}({it}) if {it} else {absent!r}")  # else: None, or no rows
 
 
-def _kept(pack: Callable[..., None], absent: bytes) -> Callable[[Any], bytearray]:
+def _kept(pack: Callable[..., None], size: int) -> Callable[[Any], bytearray]:
     """The bytes of a message; as nothing in it can change, it is packed only when it is another object than the last
     time."""
-    made, unknown = bytearray(absent), object()
-    last: Any = None
+    made, last = bytearray(size), None
 
     def data(obj: Any) -> bytearray:
         nonlocal last
         if obj is not last:
-            last = unknown  # should it not fit
-            if obj:
-                pack(made, 0, obj)
-            else:  # None, or no rows
-                made[:] = absent
+            last = None  # should it not fit
+            pack(made, 0, obj)
             last = obj
         return made
 
     return data
 
 
-def _rows(message: Message, path: str, leaves: list[Leaf]) -> Callable[..., None]:
-    """Packs a tuple of dataclasses, which is not empty, as columns."""
+def _table(path: str, leaves: list[Leaf], capacity: int) -> Callable[[Any], bytearray]:
+    """The bytes of the arrays of a table, which is copied between their tags."""
+    (head,) = {len(leaf.tag) for leaf in leaves}
+    made, shape = bytearray(b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)), (len(leaves), capacity)
+    cells = np.ndarray(shape, "<f8", made, head, (head + 8 * capacity, 8))
+
+    def data(table: Any) -> bytearray:
+        if table.shape != shape:
+            misfit(path, f"a table of {table.shape} instead of {shape}")
+        cells[...] = table
+        return made
+
+    return data
+
+
+def _rows(message: Message, path: str, leaves: list[Leaf]) -> Callable[[tuple[Any, ...]], bytearray]:
+    """The bytes of a tuple of dataclasses, which is not empty, as columns."""
     head, *columns = leaves
+    made = bytearray(sum(len(leaf.tag) + leaf.size for leaf in leaves))
 
     def pieces(rows: list[str]) -> Iterator[Piece]:
         yield head.tag + struct.pack(f"<{head.code}", len(rows))
@@ -226,12 +246,13 @@ def _rows(message: Message, path: str, leaves: list[Leaf]) -> Callable[..., None
     names = [f"row{i}" for i in range(message.capacity)]
     packers = [compiled(pieces(names[:count]), ", ".join(names[:count]), {}) for count in range(1, len(names) + 1)]
 
-    def pack(into: bytearray, at: int, rows: tuple[Any, ...]) -> None:
+    def data(rows: tuple[Any, ...]) -> bytearray:
         if len(rows) > message.capacity:
             misfit(path, f"more than {message.capacity} rows")
-        packers[len(rows) - 1](into, at, *rows)
+        packers[len(rows) - 1](made, 0, *rows)
+        return made
 
-    return pack
+    return data
 
 
 _CODE = {"<f8": "d", "<i8": "q", "<u8": "Q"}
@@ -250,6 +271,10 @@ def _build(message: Message, path: str, n: int, row: Iterator[Any]) -> Any:
     count = next(row) if message.capacity else n
     if count > rows:
         raise RecordError(f"{path}.count: {count} is more than {rows}")
+    if message.table:
+        table = np.array([np.frombuffer(next(row), np.float64) for _ in message.arrays])
+        table.setflags(write=False)
+        return message.cls(count, table)
     made = {name: _scalar(f"{path}.{name}", kind, next(row)) for name, kind in message.scalars.items()}
     for name, array in message.arrays.items():
         flat = np.frombuffer(next(row), dtype=array.dtype, count=count * array.width)

@@ -133,6 +133,7 @@ PAIRS = Message(
         "phi_dot": COLUMN, "floor": COLUMN, "achieved": COLUMN, "basis": INDICES, "outside": INDICES,
     },
     capacity=MAX_PAIRS,
+    table=True,
 )  # fmt: skip
 MONITOR = Message(
     Monitor,

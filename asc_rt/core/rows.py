@@ -22,6 +22,7 @@ from asc_rt.core.smoothing import SetPoint
 from asc_rt.core.system import System
 from asc_rt.core.types import (
     MAX_PAIRS,
+    PAIR_ROWS,
     CoreState,
     CycleInputs,
     IntMatrix,
@@ -37,8 +38,7 @@ from asc_rt.core.types import (
     vector,
 )
 
-NONE, NO_INDEX = vector([]), np.zeros(0, dtype=np.int64)
-NO_PAIRS = Pairs(NO_INDEX, NO_INDEX, NONE, NONE, NONE, NONE, NONE, NONE, NONE, NONE, NO_INDEX, NO_INDEX)
+NO_PAIRS = Pairs(0, vector(np.zeros((PAIR_ROWS, MAX_PAIRS))))
 
 
 class Rows(NamedTuple):
@@ -195,32 +195,23 @@ def _status(state: CoreState, solution: Solution | None) -> Status:
 def _pairs(system: System, found: Rows | None, ddq: Vector) -> Pairs:
     if found is None:
         return NO_PAIRS
-    achieved, rate = _achieved(found.values, found.C, ddq, system.packed_index)
-    p = MAX_PAIRS
-    frozen(found.values), frozen(found.which)
-    return Pairs(
-        robot=found.which[0, :p],
-        human=found.which[1, :p],
-        d=found.values[5, :p],
-        d_dot=found.values[6, :p],
-        M=found.M[:p],
-        M_dot=found.M_dot[:p],
-        phi=found.phi[:p],
-        phi_dot=frozen(rate)[:p],
-        floor=found.floor[:p],
-        achieved=frozen(achieved)[:p],
-        basis=found.basis[:p],
-        outside=found.which[3, :p],
-    )
+    table = _table(found.which, found.values, found.C, ddq, system.packed_index)
+    return Pairs(min(found.which.shape[1], MAX_PAIRS), frozen(table))
 
 
 @njit(cache=True)
-def _achieved(values: Matrix, C: Matrix, ddq: Vector, packed_index: Vector) -> tuple[Vector, Vector]:
-    """C u and phi_dot of what is sent."""
-    p, index = C.shape[0], safety_index.unpack(packed_index)
-    achieved, rate = np.zeros(p), np.empty(p)
-    for i in range(p):
+def _table(which: IntMatrix, values: Matrix, C: Matrix, ddq: Vector, packed_index: Vector) -> Matrix:
+    """The table of `Pairs`, with C u and phi_dot of what is sent."""
+    index, table = safety_index.unpack(packed_index), np.zeros((PAIR_ROWS, MAX_PAIRS))
+    whole = table.view(np.int64)
+    for i in range(min(C.shape[0], MAX_PAIRS)):
+        achieved = 0.0
         for j in range(ddq.shape[0]):
-            achieved[i] += C[i, j] * ddq[j]
-        rate[i] = phi_rate(values[5, i], values[6, i], achieved[i] + values[7, i], values[0, i], values[1, i], index)
-    return achieved, rate
+            achieved += C[i, j] * ddq[j]
+        M, M_dot, phi, floor = values[0, i], values[1, i], values[2, i], values[3, i]
+        d, d_dot, drift = values[5, i], values[6, i], values[7, i]
+        table[2, i], table[3, i], table[4, i], table[5, i], table[6, i] = d, d_dot, M, M_dot, phi
+        table[7, i] = phi_rate(d, d_dot, achieved + drift, M, M_dot, index)
+        table[8, i], table[9, i] = floor, achieved
+        whole[0, i], whole[1, i], whole[10, i], whole[11, i] = which[0, i], which[1, i], which[2, i], which[3, i]
+    return table

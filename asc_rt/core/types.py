@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +18,11 @@ Matrix = npt.NDArray[np.float64]
 IntVector = npt.NDArray[np.int64]
 IntMatrix = npt.NDArray[np.int64]
 BoolVector = npt.NDArray[np.bool_]
+Number = TypeVar("Number", np.int64, np.float64)
 
 MAX_CAPSULES = 20  # of all people together, from all sensors; one more is a fault, never a silent cut
 MAX_PAIRS = 32  # pairs written into one record: the nearest ones (the QP always takes all active pairs)
+PAIR_ROWS = 12  # what is written of each of them, see Pairs
 
 
 def vector(values: object) -> Vector:
@@ -269,22 +271,38 @@ class Outside(IntFlag):
     RADIUS = 4  # M at or under its floor
 
 
+class _Row(Generic[Number]):
+    """One row of `Pairs.table`, as far as it is used; whole numbers stand there by their bits."""
+
+    def __init__(self, at: int, kind: type[Number]) -> None:
+        self.at = at
+        self._kind: type[Number] = kind
+
+    def __get__(self, pairs: Pairs, owner: type) -> npt.NDArray[Number]:
+        row: npt.NDArray[Number] = pairs.table[self.at, : pairs.count].view(self._kind)
+        return row
+
+
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Active pairs (robot capsule, human capsule), nearest first; p of them."""
+    """Active pairs (robot capsule, human capsule), nearest first. In one array: twelve would take the kernels and the
+    record, that hand them over in every cycle, longer than to fill them."""
 
-    robot: IntVector  # (p,) robot capsule
-    human: IntVector  # (p,) human capsule
-    d: Vector  # (p,) m, separation distance of the bounded surfaces
-    d_dot: Vector  # (p,) m/s, worst case within the velocity bound
-    M: Vector  # (p,) m/s2, one-sided radius of the realizable set
-    M_dot: Vector  # (p,) m/s3, numeric
-    phi: Vector  # (p,) max(phi0, phi*); if M was not evaluated with M at its floor: no less than the true one
-    phi_dot: Vector  # (p,) of the control that is sent
-    floor: Vector  # (p,) m/s2, least C u that the row allows
-    achieved: Vector  # (p,) m/s2, C u of the control that is sent
-    basis: IntVector  # (p,) Basis of the floor
-    outside: IntVector  # (p,) Outside
+    count: int  # p
+    table: Matrix  # (PAIR_ROWS, MAX_PAIRS), the rows below, 0 from p on
+
+    robot = _Row(0, np.int64)  # (p,) robot capsule
+    human = _Row(1, np.int64)  # (p,) human capsule
+    d = _Row(2, np.float64)  # (p,) m, separation distance of the bounded surfaces
+    d_dot = _Row(3, np.float64)  # (p,) m/s, worst case within the velocity bound
+    M = _Row(4, np.float64)  # (p,) m/s2, one-sided radius of the realizable set
+    M_dot = _Row(5, np.float64)  # (p,) m/s3, numeric
+    phi = _Row(6, np.float64)  # (p,) max(phi0, phi*); M not evaluated: with M at its floor, no less than the true one
+    phi_dot = _Row(7, np.float64)  # (p,) of the control that is sent
+    floor = _Row(8, np.float64)  # (p,) m/s2, least C u that the row allows
+    achieved = _Row(9, np.float64)  # (p,) m/s2, C u of the control that is sent
+    basis = _Row(10, np.int64)  # (p,) Basis of the floor
+    outside = _Row(11, np.int64)  # (p,) Outside
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,18 +14,22 @@ from hypothesis.extra import numpy as hnp
 from asc_rt import record
 from asc_rt.core.types import (
     MAX_CAPSULES,
+    MAX_PAIRS,
     CycleInputs,
     EventKind,
     OperatorEvent,
+    Pairs,
     RobotFlag,
 )
 from asc_rt.fixed_protobuf import Array, Message
 from asc_rt.packing import RecordError
 from asc_rt.record import MAX_EVENTS, RecordLayout
 from drivers.base import WriteReceipt
+from tests.pairs import ROWS, pairs_of
 
 N = 6
 LAYOUT = RecordLayout(N)
+NO_ROWS = np.zeros((len(ROWS), MAX_PAIRS))
 
 int64 = st.integers(-(2**63), 2**63 - 1)
 SCALARS: dict[type, st.SearchStrategy[Any]] = {
@@ -68,7 +72,7 @@ def objects(message: Message) -> st.SearchStrategy[Any]:
         fields = {name: scalars(kind) for name, kind in message.scalars.items()}
         fields |= {name: arrays(array, rows) for name, array in message.arrays.items()}
         fields |= {name: objects(inner) for name, inner in message.messages.items()}
-        return st.builds(message.cls, **fields)
+        return st.builds(pairs_of if message.table else message.cls, **fields)
 
     made = st.integers(0, message.capacity).flatmap(with_rows) if message.capacity else with_rows(N)
     return st.none() | made if message.optional else made
@@ -209,6 +213,9 @@ def all_messages(messages: dict[str, Message]) -> list[Message]:
 
 def test_the_table_has_every_field_of_every_type() -> None:
     for message in all_messages(record.TABLE):
+        if message.table:
+            assert [vars(message.cls)[name].at for name in message.arrays] == list(range(len(message.arrays)))
+            continue
         table = {*message.scalars, *message.arrays, *message.messages}
         assert table == set(message.cls.__annotations__), message.cls
 
@@ -219,7 +226,8 @@ def plain(message: Message, rows: int = 3) -> Any:
         return ()
     rows = rows if message.capacity else N
     shapes = {name: (rows, a.width) if a.width > 1 else rows for name, a in message.arrays.items()}
-    return message.cls(
+    make = pairs_of if message.table else message.cls
+    return make(
         **{name: kind(1) for name, kind in message.scalars.items()},
         **{name: np.ones(shapes[name], a.dtype) for name, a in message.arrays.items()},
         **{name: plain(inner) for name, inner in message.messages.items()},
@@ -253,9 +261,11 @@ def test_what_does_not_fit_is_refused_and_never_cut_and_leaves_nothing_behind(ch
     assert packed(good) == before
 
 
-def test_pairs_of_unequal_length_are_refused() -> None:
+@pytest.mark.parametrize(
+    "pairs", [Pairs(1, NO_ROWS[:, :1]), Pairs(1, NO_ROWS[0]), Pairs(MAX_PAIRS + 1, NO_ROWS), Pairs(-1, NO_ROWS)]
+)
+def test_pairs_of_another_form_are_refused(pairs: Pairs) -> None:
     outputs = example()[2]
-    pairs = dataclasses.replace(outputs.decision.pairs, phi=np.ones(2))
     broken = dataclasses.replace(outputs, decision=dataclasses.replace(outputs.decision, pairs=pairs))
     with pytest.raises(RecordError, match="pairs"):
         packed(example(outputs=broken))

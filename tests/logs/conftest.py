@@ -32,7 +32,6 @@ from asc_rt.core.types import (
     JointState,
     Mode,
     OperatorEvent,
-    Pairs,
     RobotFlag,
     SafetyDecision,
     Status,
@@ -47,6 +46,7 @@ from logs import schema
 from logs.context import attachments, session
 from logs.log_file import LogFile
 from sim_hil.fanuc import wire as peer
+from tests.pairs import pairs_of
 
 PERIOD_NS = 8_000_000
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
@@ -59,7 +59,7 @@ def decide(state: CoreState, x: CycleInputs) -> tuple[CoreState, CycleOutputs]:
     q = state.q_cmd + 0.1 * (state.goal.q - state.q_cmd)
     d = float(np.linalg.norm(x.human.p0)) if x.human else float("inf")
     column, index = vector([d, d + 1.0]), np.arange(2)
-    pairs = Pairs(
+    pairs = pairs_of(
         robot=index, human=index, basis=index, d=column, d_dot=column, M=column, M_dot=column, phi=column,
         phi_dot=column, floor=column, achieved=column, outside=0 * index,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 from asc_rt.core import robot_model
 from asc_rt.core.abstraction import separation
 from asc_rt.core.people import predict
-from asc_rt.core.types import HumanState, Mode, Pairs, Status, StopReason, vector
+from asc_rt.core.types import HumanState, Mode, Status, StopReason, vector
 from logs.mcap_scan import LogError
 from logs.reader import records
 from logs.recording import open_recording
@@ -27,6 +27,7 @@ from logs.view_geometry import Segments, connecting_lines, poses
 from logs.view_layout import AMBER, GREEN, RED, layout, phi_colours
 from logs.view_live import Painter
 from logs.view_process import ViewError
+from tests.pairs import ROWS, pairs_of, with_rows
 
 PERIOD_S = 0.008
 Edit = Callable[[int, Any, Any, Any], tuple[Any, Any, Any]]
@@ -88,7 +89,7 @@ def test_plots_are_the_recorded_numbers(recording: Any, tmp_path: Path) -> None:
     def edit(i: int, state: Any, x: Any, out: Any) -> Any:
         state = dataclasses.replace(state, ddq_cmd=vector(np.full(6, 0.1 * i)))
         phi = vector([-0.5, 0.01 * i])  # the nearest pair is not the worst one
-        out = with_decision(out, pairs=dataclasses.replace(out.decision.pairs, phi=phi))
+        out = with_decision(out, pairs=with_rows(out.decision.pairs, phi=phi))
         return state, x, out
 
     cycles = edited(recording, 40, edit)
@@ -107,7 +108,7 @@ def test_plots_are_the_recorded_numbers(recording: Any, tmp_path: Path) -> None:
 
 
 def test_where_there_is_no_pair_the_plots_have_a_gap(recording: Any, tmp_path: Path) -> None:
-    none = Pairs(*(np.zeros(0, np.int64),) * 2, *(vector([]),) * 8, *(np.zeros(0, np.int64),) * 2)
+    none = pairs_of(**dict.fromkeys(ROWS, ()))
     edit: Edit = lambda i, s, x, out: (s, x, with_decision(out, pairs=none, d_measured=np.inf))  # noqa: E731
     found = content(rrd_of(recording, tmp_path, edited(recording, 10, edit)))
     assert np.isnan(scalars(found["plot/distance"])[:, :2]).all()
@@ -155,7 +156,8 @@ def judged_by_the_core(recording: Any, seed: int) -> Edit:
         pairs = separation(model.chain, model.capsules, people, q, np.zeros(6), np.inf, 0.0)
         nearest = np.argsort(pairs.d)[:10]
         d = vector(pairs.d[nearest])
-        shown = Pairs(pairs.robot[nearest], pairs.human[nearest], d, *[d] * 7, *[np.zeros(10, np.int64)] * 2)
+        rows = dict.fromkeys(ROWS, d) | {"basis": np.zeros(10), "outside": np.zeros(10)}
+        shown = pairs_of(**rows | {"robot": pairs.robot[nearest], "human": pairs.human[nearest]})
         return dataclasses.replace(state, q_cmd=q), dataclasses.replace(x, human=human), with_decision(out, pairs=shown)
 
     return edit
@@ -245,7 +247,7 @@ def test_colour_tells_the_sign_of_phi() -> None:
 
 def test_lines_carry_the_colour_of_their_phi(recording: Any, tmp_path: Path) -> None:
     edit: Edit = lambda i, s, x, out: (  # noqa: E731
-        s, x, with_decision(out, pairs=dataclasses.replace(out.decision.pairs, phi=vector([1.0, -1.0])))
+        s, x, with_decision(out, pairs=with_rows(out.decision.pairs, phi=[1.0, -1.0]))
     )  # fmt: skip
     found = content(rrd_of(recording, tmp_path, edited(recording, 8, edit)))
     packed = lambda c: int.from_bytes(bytes((*c, 255)), "big")  # noqa: E731
