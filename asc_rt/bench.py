@@ -94,9 +94,9 @@ def bench_step(params: Params) -> list[Row]:
 def bench_start(cell_name: str) -> list[Row]:
     """Wall time and greatest memory of a fresh process that imports the controller, loads the cell and warms up."""
     code = (
-        "import sys, time; began = time.perf_counter(); import asc_rt.control\n"
-        "from asc_rt import config; from asc_rt.core.system import System; from asc_rt.core.warm import warm_up\n"
-        "warm_up(System(config.load_cell(sys.argv[1]).params))\n"
+        "import sys, time; began = time.perf_counter(); from asc_rt import footprint, realtime\n"
+        "realtime.one_blas_thread(); footprint.lean_start(); from asc_rt import control, config\n"
+        "control.ready(config.load_cell(sys.argv[1]))\n"
         "seconds = time.perf_counter() - began\n"
         # not getrusage's, which counts what the process was before it ran this program, too
         "print(seconds, int(open('/proc/self/status').read().partition('VmHWM:')[2].split()[0]) / 1024)"

@@ -5,10 +5,11 @@ Exit code 0: the session ended as asked; 1: it ended for a fault; 2: it did not 
 
 from __future__ import annotations
 
-from asc_rt import launch, realtime
+from asc_rt import footprint, launch, realtime
 
 if __name__ == "__main__":
     realtime.one_blas_thread()  # before anything below imports numpy
+    footprint.lean_start()
 
 import argparse
 import math
@@ -85,8 +86,7 @@ def main(argv: list[str] | None = None) -> int:
             print(f"error: {line}", file=sys.stderr)
         return NOT_BEGUN
     try:
-        system = System(cell.params)
-        warm_up(system)
+        system = ready(cell)
         with (
             open_client(cell.bus_endpoint) as bus,
             RingWriter(args.ring) as ring,
@@ -100,6 +100,14 @@ def main(argv: list[str] | None = None) -> int:
         return NOT_BEGUN
     except KeyboardInterrupt:
         return FAILED
+
+
+def ready(cell: Cell) -> System:
+    """All that needs no robot, done."""
+    system = System(cell.params)
+    footprint.release()
+    warm_up(system)
+    return system
 
 
 def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder: RingRecorder) -> int:
@@ -123,6 +131,7 @@ def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder
         _certified(cell, system)
         warm_up(system)
         report = realtime.set_up(cell.realtime.priority, cell.realtime.cpu)
+        footprint.release()  # locked with all the rest
         if isinstance(driver, Weighted):
             # Read-only, as in the core: other arrays would compile the kernels anew, in the middle of the stream.
             driver.dynamics = lambda q, dq, ddq: torque.set_point(system, vector(q), vector(dq), vector(ddq)).tau
