@@ -131,11 +131,11 @@ def _session(cell: Cell, system: System, driver: RobotDriver, bus: Bus, recorder
         _certified(cell, system)
         warm_up(system)
         report = realtime.set_up(cell.realtime.priority, cell.realtime.cpu)
-        footprint.release()  # locked with all the rest
         if isinstance(driver, Weighted):
             # Read-only, as in the core: other arrays would compile the kernels anew, in the middle of the stream.
             driver.dynamics = lambda q, dq, ddq: torque.set_point(system, vector(q), vector(dq), vector(ddq)).tau
             driver.dynamics(system.zero, system.zero, system.zero)  # called once: loaded before there is a stream
+        footprint.release()  # locked with all the rest; after the last kernel: loading one brings LLVM back
         driver.activate(cell.params.period_ns)
         decided_with = system.params.canonical().decode()
         tell(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -16,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from asc_rt.footprint import START_ONLY
 from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -32,12 +34,13 @@ pytestmark = pytest.mark.real_time
 class Run:
     """A running `asc run --json` on ports of its own."""
 
-    def __init__(self, folder: Path, duration: float, port: int | None = None) -> None:
+    def __init__(self, folder: Path, duration: float, port: int | None = None, torque: bool = False) -> None:
         self.log = folder / "log.mcap"
         self.port = port or free_port(kind=socket.SOCK_DGRAM)
         bus = free_port()
-        settings = [f"driver.port={self.port}", f"bus.endpoint=tcp/127.0.0.1:{bus}", "human.age_limit_ms=900"]
-        command = [*ASC, "run", "fanuc-sim-truth", "--json", "--duration", str(duration), "--log", str(self.log)]
+        cell, link = ("openarm-sim", "channel=test-") if torque else ("fanuc-sim-truth", "port=")
+        settings = [f"driver.{link}{self.port}", f"bus.endpoint=tcp/127.0.0.1:{bus}", "human.age_limit_ms=900"]
+        command = [*ASC, "run", cell, "--json", "--duration", str(duration), "--log", str(self.log)]
         for setting in settings:
             command += ["--set", setting]
         self._err = folder / "stderr"
@@ -57,9 +60,12 @@ class Run:
 
     def kill(self, module: str) -> None:
         """SIGKILL to the child process that runs `module`."""
+        os.kill(self.child(module), signal.SIGKILL)
+
+    def child(self, module: str) -> int:
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         (pid,) = [int(c) for c in children if module in Path(f"/proc/{c}/cmdline").read_text().replace("\0", " ")]
-        os.kill(pid, signal.SIGKILL)
+        return pid
 
     def finish(self) -> tuple[int, dict[str, Any]]:
         out, _ = self.process.communicate(timeout=PATIENCE)
@@ -70,13 +76,24 @@ class Run:
 
 
 @contextmanager
-def running(folder: Path, duration: float, port: int | None = None) -> Iterator[Run]:
-    run = Run(folder, duration, port)
+def running(folder: Path, duration: float, port: int | None = None, torque: bool = False) -> Iterator[Run]:
+    run = Run(folder, duration, port, torque)
     try:
         yield run
     finally:
         run.process.terminate()
         run.process.wait(PATIENCE)
+
+
+def as_in_file(pid: int) -> dict[str, int]:
+    """kB that process `pid` holds of each file it has mapped, in pages that it has not made its own."""
+    kept: dict[str, int] = {}
+    for path, figures in re.findall(
+        r"^\w+-\w+ \S+ \S+ \S+ \S+ +(/.*)\n((?:\w+:.*\n)+)", Path(f"/proc/{pid}/smaps").read_text(), re.MULTILINE
+    ):
+        rss, own = (int(re.search(rf"^{name}: +(\d+) kB", figures, re.MULTILINE)[1]) for name in ("Rss", "Anonymous"))
+        kept[path] = kept.get(path, 0) + (rss if own == 0 else 0)
+    return kept
 
 
 def replay(log: Path) -> dict[str, Any]:
@@ -128,6 +145,18 @@ def test_a_dead_robot_ends_the_session_with_its_reason_and_a_whole_log(tmp_path:
     assert code == 1 and told["exit_reason"] == "ROBOT_SILENT"
     assert told["dropped_records"] == 0 and not told["truncated"]
     assert replay(run.log)["exact"]
+
+
+@pytest.mark.parametrize("torque", [False, True])
+def test_the_loop_keeps_no_pages_of_what_only_the_start_needs(tmp_path: Path, torque: bool) -> None:
+    with running(tmp_path, 60, torque=torque) as run:
+        run.await_text("ACTIVE")
+        kept = as_in_file(run.child("asc_rt.control"))
+        run.process.send_signal(signal.SIGINT)
+        code, _ = run.finish()
+    assert code == 0
+    assert any("libllvmlite" in path for path in kept) and any("libpinocchio" in path for path in kept)
+    assert not {path: kb for path, kb in kept.items() if kb and any(part in path for part in START_ONLY)}
 
 
 def test_ctrl_c_ends_cleanly_and_a_second_session_is_refused_meanwhile(tmp_path: Path) -> None:
