@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from asc_rt.core.params import MonitorParams
 from asc_rt.core.separation_monitor import greatest_speed, protective_distance, ramped_down, stopping_time, watch
+from asc_rt.core.system import System, initial
 from asc_rt.core.types import vector
 
 times, speeds, lengths = st.floats(0.0, 2.0), st.floats(0.0, 5.0), st.floats(0.0, 1.0)
@@ -75,6 +76,16 @@ def test_the_stopping_time_is_that_of_ruckig(speed: float, A: float, J: float) -
     assert found == pytest.approx(plan.duration, rel=1e-6, abs=1e-6)
 
 
+def test_the_last_joint_counts_whichever_way_it_turns() -> None:
+    limits = np.full(3, 10.0), np.full(3, 100.0)
+    found = [stopping_time(np.array(dq), *limits) for dq in ([0.1, -4.0, 1.0], [4.0, 0.1, -1.0], [-1.0, 1.0, 4.0])]
+    assert found == pytest.approx([4.0 / 10.0 + 10.0 / 100.0] * 3)
+
+
+def test_a_joint_of_unknown_speed_never_rests() -> None:
+    assert stopping_time(np.array([1.0, np.nan]), np.full(2, 10.0), np.full(2, 100.0)) == np.inf
+
+
 def test_the_fastest_point_against_pinocchio(bench: Any) -> None:
     system = bench.system()
     rng = np.random.default_rng(3)
@@ -100,6 +111,8 @@ def test_a_speed_that_is_no_number_is_the_greatest(bench: Any) -> None:
     assert greatest_speed(system.model.chain, system.model.capsules, bench.HOME, np.full(6, np.nan)) == np.inf
 
 
+@example(v=0.5, a=-1.0, J=100.0)
+@example(v=-0.5, a=1.0, J=100.0)
 @given(v=st.floats(-6.0, 6.0), a=st.floats(-100.0, 100.0), J=st.floats(10.0, 2000.0))
 def test_an_acceleration_is_ramped_down_before_the_joint_brakes(v: float, a: float, J: float) -> None:
     """Against the ramp itself, step by step: the joint is never faster than told, at its end as fast as told."""
@@ -136,3 +149,62 @@ def test_the_distance_is_that_of_the_motion_the_robot_was_told(bench: Any) -> No
         stopping_time(after, rig.system.bounds.ddq_max, rig.system.bounds.dddq_max)
     )
     assert rest.protective_distance < starts.protective_distance < moves.protective_distance
+
+
+def seen_by(bench: Any, *people: Any, robot: Any = None, monitor: MonitorParams | None = None, **changes: Any) -> Any:
+    """The figures of an arm at rest at HOME that people of these (place, position bound) are told of."""
+    system = bench.system()
+    if monitor is not None:
+        system = System(dataclasses.replace(system.params, monitor=monitor))
+    places, bounds = [place for place, _ in people], vector([bound for _, bound in people])
+    human = bench.human(places, position_bound=bounds)
+    joint = bench.joint(bench.HOME) if robot is None else robot
+    state = dataclasses.replace(initial(system), q_cmd=vector(bench.HOME))
+    return watch(system, state, bench.inputs(joint, human, **changes))
+
+
+NEAR, AWAY = ([0.9, 0.0, 0.4], 0.0), ([1.5, 0.5, 0.4], 0.0)
+
+
+def test_without_robot_or_people_there_are_no_figures(bench: Any) -> None:
+    system = bench.system()
+    joint, human = bench.joint(bench.HOME), bench.human([NEAR[0]])
+    assert watch(system, initial(system), bench.inputs(joint, human)) is not None
+    assert watch(system, initial(system), dataclasses.replace(bench.inputs(joint, human), human=None)) is None
+    assert watch(system, initial(system), bench.inputs(None, human)) is None
+
+
+def test_the_oldest_sensor_with_its_clock_error_is_the_age(bench: Any) -> None:
+    system = bench.system()
+    x = bench.inputs(bench.joint(bench.HOME), bench.human([NEAR[0]]))
+    ages = ((90_000_000, 5_000_000), (10_000_000, 1_000_000))
+    sensors = tuple(dataclasses.replace(x.sensors[0], age_ns=age, sigma_ns=sigma) for age, sigma in ages)
+    for human_age_ns, age in ((30_000_000, 0.095), (120_000_000, 0.120)):
+        found = watch(system, initial(system), dataclasses.replace(x, sensors=sensors, human_age_ns=human_age_ns))
+        assert found.age == pytest.approx(age)
+
+
+def test_an_arm_at_rest_reacts_within_a_cycle_and_its_latency(bench: Any) -> None:
+    params = bench.system().params
+    assert seen_by(bench, NEAR).reaction_time == pytest.approx(params.period + params.robot.command_latency_ns * 1e-9)
+
+
+def test_the_least_certain_part_of_a_person_counts(bench: Any) -> None:
+    certain = seen_by(bench, NEAR, AWAY)
+    unsure = seen_by(bench, (NEAR[0], 0.02), (AWAY[0], 0.05))
+    terms = certain.robot_speed, certain.age, certain.reaction_time, certain.stopping_time
+    for found, bound in ((certain, 0.0), (unsure, 0.05)):
+        expected = protective_distance(bench.system().params.monitor, *terms, bound).S_p
+        assert found.protective_distance == pytest.approx(expected)
+    assert unsure.distance == certain.distance > 0.0  # the bound is in S_p, and not in the distance as well
+
+
+def test_a_person_at_an_unknown_place_is_at_the_robot(bench: Any) -> None:
+    assert seen_by(bench, ([np.nan, 0.0, 0.4], 0.0)).distance == 0.0
+
+
+@pytest.mark.parametrize("human_speed", [1.6, 0.0])
+def test_a_robot_of_unknown_speed_is_never_far_enough(bench: Any, human_speed: float) -> None:
+    joint = bench.joint(bench.HOME, dq=vector(np.full(6, np.nan)))
+    found = seen_by(bench, AWAY, robot=joint, monitor=MonitorParams(human_speed=human_speed))
+    assert found.protective_distance == math.inf and not found.is_kept

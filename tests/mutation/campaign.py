@@ -40,6 +40,7 @@ TARGETS = {
     "limits.py": ("test_limits.py", "test_abstraction.py"),
     "safe_control.py": ("test_safe_control.py",),
     "gate.py": ("test_gate.py", "test_smoothing.py"),
+    "separation_monitor.py": ("test_separation_monitor.py",),
 }
 ITEM_SECONDS = 20  # CPU; a test that is not marked `compiled` takes a tenth: a mutant that loops for ever is killed
 
