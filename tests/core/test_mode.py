@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from asc_rt.core.mode import cut_off, next_mode, observe, stopping
+from asc_rt.core.params import MonitorParams
 from asc_rt.core.system import initial
 from asc_rt.core.types import (
     EventKind,
@@ -18,6 +19,7 @@ from asc_rt.core.types import (
     Health,
     MessageFault,
     Mode,
+    Monitor,
     OperatorEvent,
     RobotFlag,
     SensorReport,
@@ -290,12 +292,12 @@ def test_the_set_point_is_seeded_once_from_the_measured_pose(bench: Any) -> None
 
 def test_tracking_allows_for_the_way_of_the_latency_and_no_more(bench: Any) -> None:
     params = bench.system().params
-    speed = np.array([2.0, 0, 0, 0, 0, 0])
-    state = replace(in_mode(bench, M.ACTIVE), dq_cmd=vector(speed))
     allowed = params.tracking_tolerance + 2.0 * params.robot.command_latency_ns * 1e-9 * 2.0
-    for share, reason in ((0.99, R.NONE), (1.01, R.TRACKING)):
-        behind = bench.HOME - share * allowed * np.eye(6)[0]
-        assert decide(bench, state, joint=bench.joint(behind)).reason is reason
+    for speed in (2.0, -2.0):
+        state = replace(in_mode(bench, M.ACTIVE), dq_cmd=vector(speed * np.eye(6)[0]))
+        for share, reason in ((0.99, R.NONE), (1.01, R.TRACKING)):
+            behind = bench.HOME - np.sign(speed) * share * allowed * np.eye(6)[0]
+            assert decide(bench, state, joint=bench.joint(behind)).reason is reason
 
 
 def test_stopping_keeps_the_worst_reason_of_one_stop_and_forgets_older_stops(bench: Any) -> None:
@@ -311,3 +313,56 @@ def test_where_contact_cannot_be_excluded_no_way_is_known_to_lead_away(bench: An
     assert (at_work.mode, at_work.reason) == ((M.STOPPING, R.SEPARATION) if rests else (M.ACTIVE, R.NONE))
     armed = decide(bench, in_mode(bench, M.HOLD), d=d, events=event(EventKind.ARM))
     assert (armed.mode, armed.reason) == (M.HOLD, R.START_INSIDE)
+
+
+def figures(distance: float, needed: float) -> Monitor:
+    return Monitor(distance, needed, 0.1, 0.03, 0.07, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("monitor", "kept"),
+    [
+        (figures(0.8, 0.8), True),
+        (figures(0.79, 0.8), False),
+        (figures(np.inf, np.inf), True),
+        (figures(3.0, np.inf), False),
+        (None, False),
+    ],
+)
+@pytest.mark.parametrize("is_enforced", [False, True])
+def test_a_cell_that_enforces_the_protective_distance_rests_within_it(
+    bench: Any, monitor: Monitor | None, kept: bool, is_enforced: bool
+) -> None:
+    params = replace(bench.system().params, monitor=MonitorParams(is_enforced=is_enforced))
+    x = bench.inputs(bench.joint(bench.HOME))
+    moving = next_mode(params, in_mode(bench, M.ACTIVE), x, FAR_AWAY, monitor)
+    armed = next_mode(params, in_mode(bench, M.HOLD), replace(x, events=event(EventKind.ARM)), FAR_AWAY, monitor)
+    if kept or not is_enforced:
+        assert (moving.mode, moving.reason, armed.mode, armed.reason) == (M.ACTIVE, R.NONE, M.ACTIVE, R.NONE)
+    else:
+        assert (moving.mode, moving.reason, armed.mode, armed.reason) == (
+            M.STOPPING,
+            R.SEPARATION,
+            M.HOLD,
+            R.SEPARATION,
+        )
+    blind = next_mode(params, in_mode(bench, M.ACTIVE), replace(x, human=None, sensors=()), FAR_AWAY, monitor)
+    assert blind.reason is R.HUMAN_MISSING  # why there is no distance says more than that there is none
+
+
+def test_a_late_cycle_goes_on_slowly(bench: Any) -> None:
+    state = decide(bench, in_mode(bench, M.ACTIVE), late=True)
+    assert (state.mode, state.slow) == (M.ACTIVE, R.LATE)
+    assert decide(bench, state).slow is R.NONE
+
+
+def test_a_tool_of_another_weight_is_not_armed(bench: Any) -> None:
+    params, x = bench.system().params, bench.inputs(bench.joint(bench.HOME), events=event(EventKind.ARM))
+    state = next_mode(params, in_mode(bench, M.HOLD), x, FAR_AWAY, None, weighs_other=True)
+    assert (state.mode, state.reason) == (M.HOLD, R.TOOL_MISMATCH)
+
+
+@pytest.mark.parametrize(("before", "after"), [(R.NONE, R.SESSION_END), (R.HUMAN_STALE, R.HUMAN_STALE)])
+def test_the_end_keeps_why_the_robot_rested(bench: Any, before: StopReason, after: StopReason) -> None:
+    state = decide(bench, in_mode(bench, M.STOPPED, before), events=event(EventKind.END))
+    assert (state.mode, state.reason) == (M.ENDED, after)

@@ -41,6 +41,10 @@ TARGETS = {
     "safe_control.py": ("test_safe_control.py",),
     "gate.py": ("test_gate.py", "test_smoothing.py"),
     "separation_monitor.py": ("test_separation_monitor.py",),
+    "mode.py": ("test_mode.py", "test_changer.py"),
+    "human_ladder.py": ("test_human_ladder.py", "test_mode.py"),
+    "brake.py": ("test_smoothing.py", "test_step.py"),
+    "smoothing.py": ("test_smoothing.py",),
 }
 ITEM_SECONDS = 20  # CPU; a test that is not marked `compiled` takes a tenth: a mutant that loops for ever is killed
 
