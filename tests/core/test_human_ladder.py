@@ -43,6 +43,8 @@ ROWS: list[tuple[dict[str, Any], StopReason, StopReason]] = [
     ({"coverage": 0.7}, R.HUMAN_COVERAGE, R.NONE),
     ({"coverage": 0.69}, R.HUMAN_COVERAGE, R.HUMAN_COVERAGE),
     ({"coverage": float("nan")}, R.HUMAN_COVERAGE, R.HUMAN_COVERAGE),
+    ({"age_ns": 201, "coverage": 0.69}, R.HUMAN_COVERAGE, R.HUMAN_COVERAGE),  # the worst, wherever it stands
+    ({"age_ns": 101, "health": Health.DEGRADED}, R.HUMAN_UNHEALTHY, R.NONE),
     ({"calibration_hash": 7}, R.NONE, R.HUMAN_CALIBRATION),
     *(({"fault": fault}, R.NONE, reason) for fault, reason in REFUSED.items()),
     ({"id": 2}, R.NONE, R.HUMAN_MISSING),
@@ -53,6 +55,11 @@ ROWS: list[tuple[dict[str, Any], StopReason, StopReason]] = [
 def test_every_row(bench: Any, changes: dict[str, Any], slow: StopReason, stop: StopReason) -> None:
     x = bench.inputs(None, sensors=(bench.report(**FINE | changes),))
     assert judge(PARAMS, x) == Verdict(slow, stop)
+
+
+def test_sensors_that_are_well_and_nothing_of_people_is_not_nobody(bench: Any) -> None:
+    x = bench.inputs(None, sensors=(bench.report(**FINE),))
+    assert judge(PARAMS, dataclasses.replace(x, human=None)) == Verdict(R.NONE, R.HUMAN_MISSING)
 
 
 def test_every_fault_of_a_message_has_a_row() -> None:

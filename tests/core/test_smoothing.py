@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,16 @@ def test_a_control_that_no_profile_reaches_in_time_never_leaves_as_if_it_did(ben
         smooth(system, rest, vector(np.full(6, np.nan)))
     late = smooth(system, rest, vector(3.0 * T * system.bounds.dddq_max))
     assert np.all(late.ddq <= T * system.bounds.dddq_max * (1.0 + 1e-5))
+
+
+@pytest.mark.parametrize("result", [ruckig.Result.Error, ruckig.Result.ErrorExecutionTimeCalculation])
+def test_a_planner_that_only_says_that_it_failed_is_believed(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, result: ruckig.Result
+) -> None:
+    system = bench.system()
+    monkeypatch.setattr(system, "planner", SimpleNamespace(calculate=lambda request, plan: result))
+    with pytest.raises(SmoothingError):
+        smooth(system, initial(system), vector(np.zeros(6)))
 
 
 def test_the_brake_comes_to_exact_rest_within_every_limit_and_its_bound_in_time(bench: Any) -> None:
