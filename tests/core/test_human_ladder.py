@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asc_rt.core.fusion import SEVERAL, union, unsure
+from asc_rt.core.fusion import SEVERAL, heard, union, unsure
 from asc_rt.core.human_ladder import REFUSED, Verdict, judge
 from asc_rt.core.params import HumanParams, SensorParams
 from asc_rt.core.people import predict
@@ -151,10 +151,12 @@ def test_the_union_is_predicted_as_each_sensor_alone(bench: Any, waits: list[int
 
 def test_the_union_keeps_the_worst_that_they_say_of_themselves(bench: Any) -> None:
     good, bad = bench.FAR, dataclasses.replace(bench.FAR, health=Health.DEGRADED, coverage=0.5, empty_certified=False)
+    good = dataclasses.replace(good, seq=7, t_capture_ns=9_000_000)
     for states in ([good, bad], [bad, good]):
         found = union(states)
         assert found is not None
         assert (found.health, found.coverage, found.empty_certified) == (Health.DEGRADED, 0.5, False)
+        assert (found.seq, found.t_capture_ns) == (7, 9_000_000)
     assert union([]) is None and union([good]) is good
 
 
@@ -164,3 +166,23 @@ def test_a_stamp_that_may_be_off_grows_the_people_only(bench: Any) -> None:
     grown = unsure(human, 0.1)
     assert grown.position_bound == pytest.approx([0.25])
     assert grown.p0 is human.p0 and grown.velocity_bound is human.velocity_bound
+
+
+def test_the_faster_end_of_a_capsule_says_how_far_it_may_have_moved(bench: Any) -> None:
+    fast, slow = vector([[0.0, 2.0, 0.0]]), vector([[0.0, 0.0, 1.0]])
+    for v0, v1 in ((fast, slow), (slow, fast)):
+        human = dataclasses.replace(bench.human([1.0, 0.0, 0.0]), v0=v0, v1=v1)
+        assert unsure(human, 0.1).position_bound == pytest.approx([0.2])
+
+
+@pytest.mark.parametrize("somebody", [False, True])
+@pytest.mark.parametrize("certified", [False, True])
+def test_nobody_and_no_word_that_nobody_is_there_says_nothing(bench: Any, somebody: bool, certified: bool) -> None:
+    human = dataclasses.replace(bench.FAR if somebody else bench.NOBODY, empty_certified=certified)
+    (told,) = heard(human, 30)
+    assert told.says_nothing == (not somebody and not certified)
+    assert (told.id, told.seq, told.age_ns) == (human.sensor_id, human.seq, 30)
+
+
+def test_a_sensor_that_sent_nothing_was_not_heard() -> None:
+    assert heard(None, 0) == ()

@@ -16,7 +16,7 @@ from asc_rt.core.limits import command_box
 from asc_rt.core.reference import reached, reference
 from asc_rt.core.smoothing import SmoothingError, smooth
 from asc_rt.core.system import initial
-from asc_rt.core.types import Goal, vector
+from asc_rt.core.types import Goal, StopReason, vector
 
 T = 0.008
 
@@ -143,6 +143,47 @@ def test_passing_the_goal_in_motion_is_not_reaching_it(bench: Any) -> None:
     assert reached(system, state)
     assert not reached(system, replace(state, dq_cmd=vector(np.full(6, 0.2))))
     assert not reached(system, replace(state, goal=Goal(0, vector(bench.HOME))))  # no goal was ever given
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("joint", range(6))
+def test_a_goal_is_reached_from_either_side_by_every_joint(bench: Any, side: float, joint: int) -> None:
+    system, one = bench.system(), side * np.eye(6)[joint]
+    edge = system.params.task.goal_tolerance * one
+    state = replace(initial(system), q_cmd=vector(bench.HOME), goal=Goal(1, vector(bench.HOME)))
+    for share in (0.99, 1.01):
+        assert reached(system, replace(state, q_cmd=vector(bench.HOME + share * edge))) == (share < 1.0)
+        assert reached(system, replace(state, dq_cmd=vector(share * edge))) == (share < 1.0)
+
+
+def test_the_reference_is_slow_where_something_asks_for_caution(bench: Any) -> None:
+    system = bench.system()
+    state = replace(initial(system), q_cmd=vector(bench.HOME), goal=Goal(3, vector(bench.GOALS[0])))
+    top = {}
+    for slow in (StopReason.NONE, StopReason.LATE):
+        at = replace(state, slow=slow)
+        speeds = []
+        for _ in range(200):
+            at = advance(at, smooth(system, at, reference(system, at)))
+            speeds.append(np.max(np.abs(at.dq_cmd) / system.bounds.dq_max))
+        top[slow] = max(speeds)
+    assert top[StopReason.LATE] <= system.params.task.slow_speed * 1.002 < top[StopReason.NONE]
+
+
+@pytest.mark.parametrize("result", [ruckig.Result.Error, ruckig.Result.ErrorExecutionTimeCalculation])
+def test_a_way_that_cannot_be_planned_asks_for_no_acceleration(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, result: ruckig.Result
+) -> None:
+    system = bench.system()
+    state = replace(initial(system), q_cmd=vector(bench.HOME), goal=Goal(3, vector(bench.GOALS[0])))
+    assert np.any(reference(system, state))
+
+    def fails(request: Any, plan: Any) -> ruckig.Result:
+        ruckig.Ruckig(6).calculate(request, plan)  # there is something to take, but it is not to be trusted
+        return result
+
+    monkeypatch.setattr(system, "planner", SimpleNamespace(calculate=fails))
+    assert not np.any(reference(system, state))
 
 
 @pytest.mark.parametrize("wrong", ["position", "speed", "acceleration", "jerk", "jump", "nan"])

@@ -45,6 +45,11 @@ TARGETS = {
     "human_ladder.py": ("test_human_ladder.py", "test_mode.py"),
     "brake.py": ("test_smoothing.py", "test_step.py"),
     "smoothing.py": ("test_smoothing.py",),
+    "fusion.py": ("test_human_ladder.py",),
+    "levels.py": ("test_step.py",),
+    "torque.py": ("test_torque_law.py",),
+    "changer.py": ("test_changer.py",),
+    "reference.py": ("test_smoothing.py",),
 }
 ITEM_SECONDS = 20  # CPU; a test that is not marked `compiled` takes a tenth: a mutant that loops for ever is killed
 
