@@ -156,6 +156,7 @@ def test_the_loop_keeps_no_pages_of_what_only_the_start_needs(tmp_path: Path, to
         code, _ = run.finish()
     assert code == 0
     assert any("libllvmlite" in path for path in kept) and any("libpinocchio" in path for path in kept)
+    assert not any("/scipy" in path for path in kept), "numba was not started lean"
     assert not {path: kb for path, kb in kept.items() if kb and any(part in path for part in START_ONLY)}
 
 
