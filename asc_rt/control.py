@@ -86,7 +86,8 @@ def main(argv: list[str] | None = None) -> int:
             print(f"error: {line}", file=sys.stderr)
         return NOT_BEGUN
     try:
-        system = ready(cell)
+        with footprint.anew_if_compiled():
+            system = ready(cell)
         with (
             open_client(cell.bus_endpoint) as bus,
             RingWriter(args.ring) as ring,

@@ -7,13 +7,17 @@ asc_rt/README.md, "What a decision costs".
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 # Parts of paths: links the kernels; Pinocchio and all that it needs, reads the URDF. The loop runs no line of either.
 START_ONLY = ("libllvmlite", "cmeel.prefix")
+ANEW = "ASC_STARTED_ANEW"  # environment of a process that has: once is enough where kernels cannot be kept
 
 _MADV_DONTNEED = 4
 _MAPPING = re.compile(r"^(\w+)-(\w+) (\S+) \S+ \S+ \S+ *(.*)\n((?:\w+:.*\n)+)", re.MULTILINE)
@@ -45,3 +49,19 @@ def release() -> None:
             place = ctypes.c_void_p(int(start, 16)), ctypes.c_size_t(int(end, 16) - int(start, 16))
             libc.munlock(*place)
             libc.madvise(*place, _MADV_DONTNEED)
+
+
+@contextlib.contextmanager
+def anew_if_compiled() -> Iterator[None]:
+    """Start the process anew, from its first line, if a kernel had to be compiled in here: the compiler never gives
+    back what it took, 280 MB (MEASURED), and the kernels are in their cache now. Not after anything was opened: it
+    would be left behind."""
+    from numba.core import event
+
+    with event.install_recorder("numba:compile") as compiled:
+        yield
+    if compiled.buffer and ANEW not in os.environ:
+        os.environ[ANEW] = "1"
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
