@@ -10,11 +10,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from asc_rt.core.changer import torque_misfit
+from asc_rt.core.changer import knows, may_go_on, torque_misfit
 from asc_rt.core.params import STAND_IN, ChangerParams, Mount
 from asc_rt.core.robot_model import load
+from asc_rt.core.rows import Rows
+from asc_rt.core.safety_index import JERK_SHARE, psi
 from asc_rt.core.step import step
-from asc_rt.core.system import System
+from asc_rt.core.system import System, initial
 from asc_rt.core.types import EventKind, Goal, Mode, OperatorEvent, Status, StopReason, vector
 
 R, T = StopReason, 0.008
@@ -131,6 +133,7 @@ def test_a_swap_in_motion_stops_where_the_new_tool_is_too_near(bench: Any) -> No
         assert after.reason is (R.NONE if goes_on else R.TOOL_CHANGED)
 
 
+@pytest.mark.compiled
 def test_with_swaps_at_any_time_the_robot_causes_no_violation(bench: Any) -> None:
     """A person on the way; a tool appears wherever it is not inside the person's reach already."""
     rng = np.random.default_rng(4)
@@ -180,7 +183,7 @@ def test_a_person_names_the_tool_at_rest_only(bench: Any) -> None:
         made.event += 1
         return cycle(bench, made, OperatorEvent(made.event, EventKind.TOOL, tool)).state
 
-    assert (named(2).tool, named(3).tool, named(1).tool) == (1, 2, 0)
+    assert [(state.tool, state.reason) for state in map(named, (2, 3, 1))] == [(1, R.NONE), (2, R.NONE), (0, R.NONE)]
     unknown = named(9)
     assert (unknown.tool, unknown.reason) == (0, R.TOOL_MISMATCH)
     cycle(bench, made, made.arm())
@@ -213,8 +216,9 @@ def test_the_currents_tell_what_weight_is_where(bench: Any) -> None:
         for tool in TOOLS[:2]:
             for extra in (-0.7, 0.0, 0.9):
                 joint = bench.joint(q, current=vector(holding_currents(bench, tool, q, 0.05, extra)))
-                misfit = torque_misfit(bench.system(tool), joint, np.full(6, 20.0))
-                assert misfit > 1.0 if extra else misfit < 1e-6
+                for sign in (1.0, -1.0):  # of an amplifier that tells one
+                    misfit = torque_misfit(bench.system(tool), joint, np.full(6, sign * 20.0))
+                    assert misfit > 1.0 if extra else misfit < 1e-6
 
 
 @pytest.mark.parametrize(("held", "armed"), [("drill", True), ("bat", False), ("bare", False)])
@@ -235,3 +239,65 @@ def test_no_cycle_of_a_swap_is_another_kind_of_cycle(bench: Any) -> None:
     assert all(c.out.command is not None and len(c.out.decision.pairs.M) for c in cycles)
     assert {c.out.decision.status for c in cycles} == {Status.STOPPED}
     assert cycles[-1].state.mode is Mode.STOPPED
+
+
+def test_a_person_names_only_what_is_mounted_and_not_what_the_robot_tells(bench: Any) -> None:
+    for told_by_robot, stand_in, number, may in (
+        (False, False, 2, True),
+        (False, False, 7, False),
+        (False, True, 7, True),
+        (True, False, 2, False),
+    ):
+        params = make(bench, told_by_robot=told_by_robot, stand_in=stand_in).params
+        assert knows(params, number) is may
+
+
+def of_one_pair(n: int, d: float, d_dot: float, own: float, M: float, C: Any = None, drift: float = 0.0) -> Rows:
+    """What may_go_on looks at: one pair, as `rows` would hand it over."""
+    values = np.array([M, 0.0, 0.0, 0.0, 0.0, d, d_dot, drift, own, 0.0])[:, None]
+    return Rows(np.zeros((4, 1), np.int64), values, np.zeros((1, n)) if C is None else C[None], np.zeros((2, n)))
+
+
+def swap(bench: Any, dq: Any, found: Rows, d: float = 1.0, ddq: Any = None) -> bool:
+    system = make(bench, goes_on=True)
+    held = system.holding(1)
+    zero = vector(np.zeros(6))
+    state = replace(initial(system), dq_cmd=vector(dq), ddq_cmd=zero if ddq is None else vector(ddq))
+    return may_go_on(system.params, held, state, found, d)
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_swap_goes_on_at_no_more_than_the_new_tools_speed(bench: Any, joint: int, side: float) -> None:
+    far = of_one_pair(6, 5.0, 0.0, 0.0, 0.0)
+    fastest = side * make(bench, goes_on=True).holding(1).bounds.dq_max * np.eye(6)[joint]
+    assert swap(bench, 0.99 * fastest, far) and not swap(bench, 1.01 * fastest, far)
+    rearm = bench.params().safety.rearm_distance
+    assert swap(bench, 0.5 * fastest, far, rearm) and not swap(bench, 0.5 * fastest, far, rearm - 1e-6)
+
+
+@pytest.mark.parametrize(("d_dot", "own", "closing"), [(-0.3, 0.0, 0.3), (0.1, -0.2, 0.2), (-0.1, -0.4, 0.4)])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_where_the_control_hardly_reaches_there_is_room_for_the_whole_brake(
+    bench: Any, d_dot: float, own: float, closing: float, side: float
+) -> None:
+    """The slowest joint's S-curve, |dq| / A + A / J, at the closing speed, on top of d_min."""
+    held = make(bench, goes_on=True).holding(1)
+    dq = side * np.array([0.1, 0.9, 0.2, 0.1, 0.3, 0.1])
+    takes = max(abs(v) / A + A / J for v, A, J in zip(dq, held.bounds.ddq_max, held.bounds.dddq_max, strict=True))
+    needed = held.params.safety.d_min + closing * takes
+    for share in (-1e-4, 1e-4):
+        assert swap(bench, dq, of_one_pair(6, needed + share, d_dot, own, 0.0)) is (share > 0.0)
+
+
+def test_where_it_reaches_the_pair_has_to_be_in_the_set_that_the_rows_keep(bench: Any) -> None:
+    held, rng = make(bench, goes_on=True).holding(1), np.random.default_rng(2)
+    for _ in range(30):
+        C, ddq, drift = rng.normal(0.0, 0.3, 6), rng.normal(0.0, 1.0, 6), rng.normal(0.0, 0.3)
+        v, M = rng.uniform(0.05, 0.6), rng.uniform(0.5, 3.0)
+        J = JERK_SHARE * float(np.abs(C) @ held.bounds.dddq_max)
+        excess = [psi(d, v, -(float(C @ ddq) + drift), M, 0.0, J, held.index) for d in np.linspace(0.05, 3.0, 60)]
+        for d, value in zip(np.linspace(0.05, 3.0, 60), excess, strict=True):
+            found = of_one_pair(6, float(d), -v, 0.0, M, C, drift)
+            assert swap(bench, np.full(6, 0.1), found, ddq=ddq) is bool(value <= 0.0)
+        assert min(excess) <= 0.0 < max(excess)

@@ -99,6 +99,15 @@ def test_the_brake_comes_to_exact_rest_within_every_limit_and_its_bound_in_time(
         assert not np.any(still.dq) and not np.any(still.ddq)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("joint", range(6))
+def test_rest_is_every_joint_without_speed_and_acceleration(bench: Any, joint: int, side: float) -> None:
+    state, one = initial(bench.system()), side * np.eye(6)[joint]
+    assert at_rest(state)
+    assert not at_rest(replace(state, dq_cmd=vector(1e-6 * one)))
+    assert not at_rest(replace(state, ddq_cmd=vector(1e-3 * one)))
+
+
 def test_planning_the_brake_anew_each_cycle_gives_the_same_profile(bench: Any) -> None:
     system = bench.system()
     r = system.params.robot

@@ -238,6 +238,7 @@ def test_rows_in_conflict_brake_the_robot(bench: Any, monkeypatch: pytest.Monkey
     check_set_points(bench, bench.system(), rig.cycles)
 
 
+@pytest.mark.compiled
 def test_the_robot_stops_before_a_person_who_stands_there_and_stays_out_of_d_min(bench: Any) -> None:
     system = bench.system()
     person = bench.human(*POST, 0.13)
@@ -250,6 +251,7 @@ def test_the_robot_stops_before_a_person_who_stands_there_and_stays_out_of_d_min
     check_set_points(bench, system, rig.cycles)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("seconds", [3.5, 1.8])
 def test_a_person_who_walks_in_is_never_approached_inside_d_min(bench: Any, seconds: float) -> None:
     system = bench.system()
@@ -350,6 +352,7 @@ def random_inputs(bench: Any, rng: Any, rig: Any, tick: int) -> dict[str, Any]:
     return changes
 
 
+@pytest.mark.compiled
 def test_no_valid_input_raises_or_breaks_a_limit(bench: Any) -> None:
     system = bench.system()
     rng = np.random.default_rng(11)

@@ -11,10 +11,11 @@ import pinocchio as pin
 import pytest
 
 from asc_rt.config import load_cell
+from asc_rt.core.levels import LEVELS
 from asc_rt.core.smoothing import SmoothingError
 from asc_rt.core.system import System, initial
-from asc_rt.core.torque import HELD, ON_THE_WAY, reference, set_point, stop
-from asc_rt.core.types import Goal, StopReason, vector
+from asc_rt.core.torque import HELD, ON_THE_WAY, REST_SPEED, reference, set_point, stop
+from asc_rt.core.types import Goal, Mode, StopReason, vector
 
 ONE = np.array([1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.1])
 
@@ -123,3 +124,35 @@ def test_a_held_goal_is_crept_back_to() -> None:
     way = 0.9 * tolerance * np.sign(ONE)
     state = moving(q, 0.0 * ONE, goal=Goal(3, vector(q + way)), reached_id=3)
     np.testing.assert_allclose(reference(system, state) / HELD[1], ON_THE_WAY[0] * tolerance * np.sign(ONE), rtol=1e-9)
+
+
+TRACK = LEVELS["torque"].track
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_what_is_measured_is_followed_in_motion_only(bench: Any, mode: Mode) -> None:
+    """At rest nothing may drag the held pose along; without a sample there is nothing to follow."""
+    system, q = panda(), middle(panda())
+    state = moving(q, 0.1 * ONE, mode=mode, ddq_cmd=vector(0.3 * ONE))
+    x = sampled(bench, q + 0.01, 0.2 * ONE)
+    assert TRACK(system, state, dataclasses.replace(x, joint=None)) is state
+    after = TRACK(system, state, x)
+    if mode in (Mode.ACTIVE, Mode.STOPPING):
+        assert (after.q_cmd == q + 0.01).all() and (after.dq_cmd == 0.2 * ONE).all()
+        assert (after.ddq_cmd == state.ddq_cmd).all()
+    else:
+        assert after is state
+
+
+@pytest.mark.parametrize("mode", [Mode.ACTIVE, Mode.STOPPING])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_stop_ends_where_every_joint_hardly_moves(bench: Any, mode: Mode, side: float) -> None:
+    system, q = panda(), middle(panda())
+    state = moving(q, 0.1 * ONE, mode=mode, ddq_cmd=vector(0.3 * ONE))
+    for share in (0.99, 1.01):
+        dq = np.where(np.arange(7) == 3, side * share * REST_SPEED, 0.0)
+        after = TRACK(system, state, sampled(bench, q + 0.01, dq))
+        assert (after.q_cmd == q + 0.01).all()
+        rests = mode is Mode.STOPPING and share < 1.0
+        assert (after.dq_cmd == (0.0 * dq if rests else dq)).all()
+        assert after.ddq_cmd.any() != rests

@@ -46,9 +46,9 @@ TARGETS = {
     "brake.py": ("test_smoothing.py", "test_step.py"),
     "smoothing.py": ("test_smoothing.py",),
     "fusion.py": ("test_human_ladder.py",),
-    "levels.py": ("test_step.py",),
+    "levels.py": ("test_torque_law.py",),
     "torque.py": ("test_torque_law.py",),
-    "changer.py": ("test_changer.py",),
+    "changer.py": ("test_changer.py", "test_mode.py"),
     "reference.py": ("test_smoothing.py",),
 }
 ITEM_SECONDS = 20  # CPU; a test that is not marked `compiled` takes a tenth: a mutant that loops for ever is killed
