@@ -188,16 +188,39 @@ def _pieces(message: Message, n: int, path: str, it: str, leaves: Iterator[Leaf]
 
 
 def _choice(message: Message, n: int, path: str, it: str, leaves: list[Leaf], names: Names) -> Piece:
-    """The piece of a message that may be absent."""
+    """The piece of a message that may be absent, or of a tuple of them."""
     name, absent = path.replace(".", "_"), b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)
-    if not (message.kept or message.rows):
-        return Choice(it, name, absent, list(_pieces(message, n, path, name, iter(leaves), names)))
-    if message.rows:
-        names[name] = _rows(message, path, leaves)
-    else:
-        own: Names = {}
-        names[name] = _kept(compiled(list(_pieces(message, n, path, "it", iter(leaves), own)), "it", own), len(absent))
+    cases = _of_rows if message.rows else _of_optional
+    if not message.kept:
+        return Choice(it, name, cases(message, n, path, name, leaves, absent, names))
+    own: Names = {}
+    pack = compiled([Choice("it", name, cases(message, n, path, name, leaves, absent, own))], "it", own)
+    names[name] = _kept(pack, len(absent))
     return Value(f"{len(absent)}s", f"{name}({it}) if {it} else {absent!r}")  # else: None, or no rows
+
+
+Cases = list[tuple[str, list[Piece]]]
+
+
+def _of_optional(
+    message: Message, n: int, path: str, name: str, leaves: list[Leaf], absent: bytes, names: Names
+) -> Cases:
+    return [(f"{name} is None", [absent]), ("", list(_pieces(message, n, path, name, iter(leaves), names)))]
+
+
+def _of_rows(message: Message, n: int, path: str, name: str, leaves: list[Leaf], absent: bytes, names: Names) -> Cases:
+    """A tuple of dataclasses, written as columns: the pieces for each number of them."""
+    head, *columns = leaves
+
+    def pieces(count: int) -> Iterator[Piece]:
+        yield head.tag + struct.pack(f"<{head.code}", count)
+        for (column, array), leaf in zip(message.arrays.items(), columns, strict=True):
+            yield leaf.tag
+            yield from (Value(_CODE[array.dtype], f"{name}[{i}].{column}") for i in range(count))
+            yield bytes(8 * (message.capacity - count))
+
+    refused = Value(f"{len(absent)}s", f"misfit({path!r}, 'more than {message.capacity} rows')")
+    return [*((f"len({name}) == {k}", list(pieces(k))) for k in range(message.capacity + 1)), ("", [refused])]
 
 
 def _kept(pack: Callable[..., None], size: int) -> Callable[[Any], bytearray]:
@@ -226,30 +249,6 @@ def _table(path: str, leaves: list[Leaf], capacity: int) -> Callable[[Any], byte
         if table.shape != shape:
             misfit(path, f"a table of {table.shape} instead of {shape}")
         cells[...] = table
-        return made
-
-    return data
-
-
-def _rows(message: Message, path: str, leaves: list[Leaf]) -> Callable[[tuple[Any, ...]], bytearray]:
-    """The bytes of a tuple of dataclasses, which is not empty, as columns."""
-    head, *columns = leaves
-    made = bytearray(sum(len(leaf.tag) + leaf.size for leaf in leaves))
-
-    def pieces(rows: list[str]) -> Iterator[Piece]:
-        yield head.tag + struct.pack(f"<{head.code}", len(rows))
-        for (name, array), leaf in zip(message.arrays.items(), columns, strict=True):
-            yield leaf.tag
-            yield from (Value(_CODE[array.dtype], f"{row}.{name}") for row in rows)
-            yield bytes(8 * (message.capacity - len(rows)))
-
-    names = [f"row{i}" for i in range(message.capacity)]
-    packers = [compiled(pieces(names[:count]), ", ".join(names[:count]), {}) for count in range(1, len(names) + 1)]
-
-    def data(rows: tuple[Any, ...]) -> bytearray:
-        if len(rows) > message.capacity:
-            misfit(path, f"more than {message.capacity} rows")
-        packers[len(rows) - 1](made, 0, *rows)
         return made
 
     return data

@@ -26,12 +26,12 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A message that may be absent: the expression that finds it, and the pieces of what is found, under `name`."""
+    """What has more than one form, all of one size: the expression that finds it, its `name` from there on, and
+    conditions on that with the pieces for each; the last, "", holds where no other does."""
 
     it: str
     name: str
-    absent: bytes
-    present: list[Piece]
+    cases: list[tuple[str, list[Piece]]]
 
 
 Piece = bytes | Value | Choice  # bytes: tags, and values that are always the same
@@ -65,10 +65,13 @@ def _lines(pieces: Iterable[Piece], offset: int, names: Names) -> tuple[list[str
                 lines.append(line)
             continue
         for choice in (piece for piece in group if isinstance(piece, Choice)):
-            without, _ = _call([Value(f"{len(choice.absent)}s", repr(choice.absent))], offset, names)
-            inner, offset = _lines(choice.present, offset, names)
-            lines += [f"{choice.name} = {choice.it}", f"if {choice.name} is None:", f"    {without}", "else:"]
-            lines += [f"    {line}" for line in inner]
+            lines.append(f"{choice.name} = {choice.it}")
+            word, end = "if", offset
+            for condition, form in choice.cases:
+                inner, end = _lines(form, offset, names)
+                lines += [f"{word} {condition}:" if condition else "else:", *(f"    {line}" for line in inner)]
+                word = "elif"
+            offset = end
     return lines, offset
 
 

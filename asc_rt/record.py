@@ -122,7 +122,7 @@ INPUTS = Message(
     {
         "tick": int, "t_ns": int, "period_ns": int, "human_age_ns": int, "missed_ticks": int,
         "late": bool, "joint": JOINT, "human": HUMAN, "goal": Message(Goal, GOAL, optional=True, kept=True),
-        "events": Message(OperatorEvent, EVENT, capacity=MAX_EVENTS, rows=True),
+        "events": Message(OperatorEvent, EVENT, capacity=MAX_EVENTS, rows=True, kept=True),
         "sensors": Message(SensorReport, SENSOR, capacity=MAX_SENSORS, rows=True),
     },
 )  # fmt: skip
