@@ -50,6 +50,7 @@ TARGETS = {
     "torque.py": ("test_torque_law.py",),
     "changer.py": ("test_changer.py", "test_mode.py"),
     "reference.py": ("test_smoothing.py",),
+    "rows.py": ("test_rows.py", "test_safety_index.py"),
 }
 ITEM_SECONDS = 20  # CPU; a test that is not marked `compiled` takes a tenth: a mutant that loops for ever is killed
 
