@@ -145,10 +145,14 @@ def _leaves(message: Message, n: int, path: str) -> list[Leaf]:
 
 def _headed(number: int, leaves: list[Leaf]) -> list[Leaf]:
     """The leaves of a message with its tag and length put before the first."""
-    size = sum(len(leaf.tag) + leaf.size for leaf in leaves)
     first = leaves[0]
-    head = tag(number, LENGTH) + varint(size) + first.tag
+    head = tag(number, LENGTH) + varint(len(_blank(leaves))) + first.tag
     return [dataclasses.replace(first, tag=head), *leaves[1:]]
+
+
+def _blank(leaves: list[Leaf]) -> bytes:
+    """The leaves with nothing in them: what an absent message is."""
+    return b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -173,12 +177,13 @@ def _pieces(message: Message, n: int, path: str, it: str, leaves: Iterator[Leaf]
     if message.table:
         columns, name = list(itertools.islice(leaves, len(message.arrays))), f"table_{path.replace('.', '_')}"
         names[name] = _table(path, columns, message.capacity)
-        yield Value(f"{sum(len(leaf.tag) + leaf.size for leaf in columns)}s", f"{name}({it}.table)")
-    for name, array in {} if message.table else message.arrays.items():  # struct would pad or cut silently
-        leaf = next(leaves)
-        yield leaf.tag
-        fits = f"len(data := {it}.{name}.tobytes()) == {8 * array.width} * {rows}"
-        yield Value(leaf.code, f"data if {fits} else misfit({leaf.path!r}, 'not an 8-byte number for each place')")
+        yield Value(f"{len(_blank(columns))}s", f"{name}({it}.table)")
+    else:
+        for name, array in message.arrays.items():  # struct would pad or cut silently
+            leaf = next(leaves)
+            yield leaf.tag
+            fits = f"len(data := {it}.{name}.tobytes()) == {8 * array.width} * {rows}"
+            yield Value(leaf.code, f"data if {fits} else misfit({leaf.path!r}, 'not an 8-byte number for each place')")
     for name, inner in message.messages.items():
         inner_path, inner_it = f"{path}.{name}", f"{it}.{name}"
         if inner.optional or inner.rows:
@@ -189,26 +194,23 @@ def _pieces(message: Message, n: int, path: str, it: str, leaves: Iterator[Leaf]
 
 def _choice(message: Message, n: int, path: str, it: str, leaves: list[Leaf], names: Names) -> Piece:
     """The piece of a message that may be absent, or of a tuple of them."""
-    name, absent = path.replace(".", "_"), b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)
-    cases = _of_rows if message.rows else _of_optional
+    name, absent = path.replace(".", "_"), _blank(leaves)
+
+    def choice(it: str, names: Names) -> Choice:
+        if message.rows:
+            return Choice(it, name, _of_rows(message, path, name, leaves))
+        return Choice(
+            it, name, [(f"{name} is None", [absent]), ("", list(_pieces(message, n, path, name, iter(leaves), names)))]
+        )
+
     if not message.kept:
-        return Choice(it, name, cases(message, n, path, name, leaves, absent, names))
+        return choice(it, names)
     own: Names = {}
-    pack = compiled([Choice("it", name, cases(message, n, path, name, leaves, absent, own))], "it", own)
-    names[name] = _kept(pack, len(absent))
+    names[name] = _kept(compiled([choice("it", own)], "it", own), len(absent))
     return Value(f"{len(absent)}s", f"{name}({it}) if {it} else {absent!r}")  # else: None, or no rows
 
 
-Cases = list[tuple[str, list[Piece]]]
-
-
-def _of_optional(
-    message: Message, n: int, path: str, name: str, leaves: list[Leaf], absent: bytes, names: Names
-) -> Cases:
-    return [(f"{name} is None", [absent]), ("", list(_pieces(message, n, path, name, iter(leaves), names)))]
-
-
-def _of_rows(message: Message, n: int, path: str, name: str, leaves: list[Leaf], absent: bytes, names: Names) -> Cases:
+def _of_rows(message: Message, path: str, name: str, leaves: list[Leaf]) -> list[tuple[str, list[Piece]]]:
     """A tuple of dataclasses, written as columns: the pieces for each number of them."""
     head, *columns = leaves
 
@@ -219,7 +221,7 @@ def _of_rows(message: Message, n: int, path: str, name: str, leaves: list[Leaf],
             yield from (Value(_CODE[array.dtype], f"{name}[{i}].{column}") for i in range(count))
             yield bytes(8 * (message.capacity - count))
 
-    refused = Value(f"{len(absent)}s", f"misfit({path!r}, 'more than {message.capacity} rows')")
+    refused = Value(f"{len(_blank(leaves))}s", f"misfit({path!r}, 'more than {message.capacity} rows')")
     return [*((f"len({name}) == {k}", list(pieces(k))) for k in range(message.capacity + 1)), ("", [refused])]
 
 
@@ -242,7 +244,7 @@ def _kept(pack: Callable[..., None], size: int) -> Callable[[Any], bytearray]:
 def _table(path: str, leaves: list[Leaf], capacity: int) -> Callable[[Any], bytearray]:
     """The bytes of the arrays of a table, which is copied between their tags."""
     (head,) = {len(leaf.tag) for leaf in leaves}
-    made, shape = bytearray(b"".join(leaf.tag + bytes(leaf.size) for leaf in leaves)), (len(leaves), capacity)
+    made, shape = bytearray(_blank(leaves)), (len(leaves), capacity)
     cells = np.ndarray(shape, "<f8", made, head, (head + 8 * capacity, 8))
 
     def data(table: Any) -> bytearray:
